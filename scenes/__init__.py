@@ -19,24 +19,3 @@ from scenes.randomisation import RandomisationSpec
 from scenes.rig import RigSpec
 from scenes.sensor import SensorSpec
 from scenes.servo import PlacementSpec, ServoSpec
-
-__all__ = [
-    "ExperimentSpec",
-    "ObjectSpec",
-    "PlacementSpec",
-    "RandomisationSpec",
-    "RigSpec",
-    "SensorSpec",
-    "ServoSpec",
-    "SpecError",
-    "list_experiments",
-    "list_objects",
-    "list_randomisations",
-    "list_sensors",
-    "load_experiment",
-    "load_object",
-    "load_randomisation",
-    "load_sensor",
-    "load_servo",
-    "user_spec_dir",
-]

@@ -29,15 +29,11 @@ def sensor_files(spec: SensorSpec, stem: str, comment: str = "", notes: Mapping[
     dict of str to str
         Text of each file by its name. The TOML file comes last, because it names the tables (see ``scenes.tables``).
     """
-    document = tomlkit.document()
-    for line in comment.splitlines():
-        document.add(tomlkit.comment(line))
     given = {key: value for key, value in spec.model_dump(exclude_defaults=True).items() if key != "name" and value is not None}
     layout = {"layout": spec.pins.layout} | spec.pins.shape.model_dump(exclude_defaults=True)
     given["pins"] = layout | given.get("pins", {})  # the layout is written even if it is the default
     plain, tables = take_out_tables(given, stem)
-    for key in sorted(plain, key=lambda k: isinstance(plain[k], dict)):  # tables come last
-        document.add(key, _item(plain[key]))
+    document = toml_document(plain, comment)
     for dotted, note in (notes or {}).items():
         *sections, name = dotted.split(".")
         table: object = document
@@ -46,6 +42,16 @@ def sensor_files(spec: SensorSpec, stem: str, comment: str = "", notes: Mapping[
         if isinstance(table, dict) and name in table and hasattr(table[name], "comment"):
             table[name].comment(note)
     return {**tables, f"{stem}.toml": tomlkit.dumps(document)}
+
+
+def toml_document(content: Mapping[str, object], comment: str = "") -> tomlkit.TOMLDocument:
+    """A readable TOML document with comment lines at its beginning. Floats are rounded to the digits that tables have."""
+    document = tomlkit.document()
+    for line in comment.splitlines():
+        document.add(tomlkit.comment(line))
+    for key in sorted(content, key=lambda k: isinstance(content[k], dict)):  # tables come last
+        document.add(key, _item(content[key]))
+    return document
 
 
 def _item(value: object) -> object:

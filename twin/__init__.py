@@ -32,50 +32,29 @@ from typing import Any
 
 from twin.lazy import WhenImported, offered_name
 
-_PLACES = {
-    "BaselinesVecEnv": "training.environments.baselines",
-    "ContactPose": "twin.mechanics.path",
-    "Form": "twin.types",
-    "Frame": "twin.types",
-    "Observation": "twin.types",
-    "Pipeline": "twin.pins.pipeline",
-    "SafeArm": "hardware.safety.safe_arm",
-    "Simulator": "twin.simulator",
-    "TactileScene": "training.mujoco.scene",
-    "attach_sensor": "training.mujoco.model",
-    "audit": "twin.cli.calibration",
-    "calibrate_contact": "twin.cli.calibration",
-    "calibrate_optics": "twin.cli.calibration",
-    "check": "twin.cli.frames",
-    "collect": "twin.cli.live",
-    "demonstrate": "twin.cli.learning",
-    "evaluate": "twin.cli.learning",
-    "learn": "twin.cli.learning",
-    "load_experiment": "scenes",
-    "load_limits": "hardware.safety.decide",
-    "load_model": "training.estimate.loading:load_with_history",
-    "load_object": "scenes",
-    "load_sensor": "scenes",
-    "load_scene": "training.mujoco.model",
-    "make_dataset": "twin.cli.learning",
-    "new_sensor": "twin.cli.calibration",
-    "node_features": "twin.pins.graph",
-    "open_arm": "hardware.arms.open_arm",
-    "open_camera": "hardware.cameras.choose",
-    "predict": "twin.cli.learning",
-    "preprocess": "twin.cli.frames",
-    "realism": "twin.cli.calibration",
-    "record": "twin.cli.calibration",
-    "register_environments": "training.environments:register_all",
-    "robustness": "twin.cli.calibration",
-    "run_policy": "twin.cli.live",
-    "servo": "twin.cli.live",
-    "train": "twin.cli.learning",
-    "tune": "twin.cli.frames",
-    "validate": "twin.cli.calibration",
-    "write_urdf": "training.mujoco.model",
+_OFFERED = {
+    "hardware.arms.open_arm": ("open_arm",),
+    "hardware.cameras.choose": ("open_camera",),
+    "hardware.safety.decide": ("load_limits",),
+    "hardware.safety.safe_arm": ("SafeArm",),
+    "scenes": ("load_experiment", "load_object", "load_sensor"),
+    "training.environments.baselines": ("BaselinesVecEnv",),
+    "training.mujoco.model": ("attach_sensor", "load_scene", "write_urdf"),
+    "training.mujoco.scene": ("TactileScene",),
+    "twin.cli.calibration": ("audit", "calibrate_contact", "calibrate_optics", "new_sensor", "realism", "record", "robustness", "validate"),
+    "twin.cli.frames": ("check", "preprocess", "tune"),
+    "twin.cli.learning": ("demonstrate", "evaluate", "learn", "make_dataset", "predict", "train"),
+    "twin.cli.live": ("collect", "run_policy", "servo"),
+    "twin.mechanics.path": ("ContactPose",),
+    "twin.pins.graph": ("node_features",),
+    "twin.pins.pipeline": ("Pipeline",),
+    "twin.simulator": ("Simulator",),
+    "twin.types": ("Form", "Frame", "Observation"),
 }
-"""By public name: its module, and its name there if that is another."""
+"""By module: the names that are taken from it."""
+_RENAMED = {"load_model": "training.estimate.loading:load_with_history", "register_environments": "training.environments:register_all"}
+"""By public name: its module, and its other name there."""
+_PLACES = {name: place for place, names in _OFFERED.items() for name in names} | _RENAMED
 _MODULES = ("errors", "extend")
 
 

@@ -106,6 +106,91 @@ def calibrate_optics(
     progress: Progress | bool | None = ...,
 ) -> OpticsCalibration: ...
 
+def new_sensor(
+    frames: Path | str | None = ...,
+    *,
+    out: Path | str,
+    camera: str | Path = ...,
+    label_table: Path | str | None = ...,
+    experiment: str | Path | ExperimentSpec | None = ...,
+    contacts: int = ...,
+    optics: bool = ...,
+    workers: int = ...,
+    elements: int = ...,
+    layout: str | None = ...,
+    radius_mm: float | None = ...,
+    no_contact: Path | str | None = ...,
+    table: Path | str | None = ...,
+    form: Form | str | None = ...,
+    max_frames: int = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> WholeSensor: ...
+
+def realism(
+    path: Path | str,
+    *,
+    sensor: str | Path | SensorSpec,
+    out: Path | str,
+    pose_aligned: bool = ...,
+    max_frames: int | None = ...,
+    fitted: int = ...,
+    without: str | Sequence[str] | None = ...,
+    residual: bool = ...,
+    quality: Literal['rasterised', 'preview', 'standard', 'high'] = ...,
+    two_sample: bool = ...,
+    thorough: bool = ...,
+    table: Path | str | None = ...,
+    pipeline: Path | str | None = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> Realism: ...
+
+def record(
+    *,
+    camera: str | Path,
+    out: Path | str,
+    count: int = ...,
+    port: int = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> RecordedFrames: ...
+
+def robustness(
+    *,
+    sensor: str | Path | SensorSpec,
+    out: Path | str,
+    pipeline: str | Sequence[str] | None = ...,
+    model: Path | str | Sequence[Path | str] | None = ...,
+    conditions: Path | str | None = ...,
+    frames: Path | str | None = ...,
+    max_frames: int = ...,
+    rendered: bool = ...,
+    jobs: int = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> DegradationResult: ...
+
+def validate(
+    *,
+    sensor: str | Path | SensorSpec,
+    frames: Path | str,
+    out: Path | str,
+    experiment: str | Path | ExperimentSpec = ...,
+    obj: str | Path | ObjectSpec | None = ...,
+    max_frames: int | None = ...,
+    friction_frames: int = ...,
+    seed: int = ...,
+    elements: int = ...,
+    form: Form | str | None = ...,
+    table: Path | str | None = ...,
+    no_contact: Path | str | None = ...,
+    pipeline: Path | str | None = ...,
+    column: str | Sequence[str] | None = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> Validation | ForceComparison: ...
+
 def check(
     source: str | Path,
     *,
@@ -123,27 +208,33 @@ def check(
     progress: Progress | bool | None = ...,
 ) -> Examination: ...
 
-def collect(
+def preprocess(
+    path: Path | str,
     *,
-    camera: str | Path,
-    arm: str,
     sensor: str | Path | SensorSpec,
     out: Path | str,
-    experiment: str | Path | ExperimentSpec = ...,
-    count: int = ...,
-    obj: str | Path | ObjectSpec | None = ...,
-    servo: str | Path | ServoSpec = ...,
     form: Form | str | None = ...,
-    safety: str | None = ...,
-    seed: int | None = ...,
-    design: str = ...,
-    plain_light: bool = ...,
-    also: str | Sequence[str] | None = ...,
-    ros2: str | None = ...,
-    dry_run: bool = ...,
+    overlay: bool = ...,
+    table: Path | str | None = ...,
+    no_contact: Path | str | None = ...,
+    pipeline: Path | str | None = ...,
     force: bool = ...,
     progress: Progress | bool | None = ...,
-) -> Collected: ...
+) -> Preprocessed: ...
+
+def tune(
+    *,
+    sensor: str | Path | SensorSpec,
+    frames: Path | str,
+    out: Path | str | None = ...,
+    method: Literal['twin', 'legacy', 'adaptive', 'fixed', 'simple', 'log', 'dog', 'doh'] = ...,
+    form: Form | str | None = ...,
+    max_frames: int = ...,
+    table: Path | str | None = ...,
+    no_contact: Path | str | None = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> TunedOnFrames: ...
 
 def demonstrate(
     *,
@@ -215,27 +306,6 @@ def make_dataset(
     progress: Progress | bool | None = ...,
 ) -> Simulated: ...
 
-def new_sensor(
-    frames: Path | str | None = ...,
-    *,
-    out: Path | str,
-    camera: str | Path = ...,
-    label_table: Path | str | None = ...,
-    experiment: str | Path | ExperimentSpec | None = ...,
-    contacts: int = ...,
-    optics: bool = ...,
-    workers: int = ...,
-    elements: int = ...,
-    layout: str | None = ...,
-    radius_mm: float | None = ...,
-    no_contact: Path | str | None = ...,
-    table: Path | str | None = ...,
-    form: Form | str | None = ...,
-    max_frames: int = ...,
-    force: bool = ...,
-    progress: Progress | bool | None = ...,
-) -> WholeSensor: ...
-
 def predict(
     run: Path | str,
     frame: Path | str,
@@ -247,63 +317,52 @@ def predict(
     force: bool = ...,
 ) -> Predictions: ...
 
-def preprocess(
-    path: Path | str,
+def train(
     *,
+    model: str,
     sensor: str | Path | SensorSpec,
+    data: Path | str | Sequence[Path | str],
     out: Path | str,
+    target: str | Sequence[str] = ...,
+    label_kind: str = ...,
+    seed: int = ...,
+    split: int = ...,
+    epochs: int | None = ...,
+    batch: int | None = ...,
+    members: int | None = ...,
+    kernel: bool | None = ...,
+    max_minutes: float | None = ...,
+    threads: int | None = ...,
+    device: str = ...,
     form: Form | str | None = ...,
-    overlay: bool = ...,
     table: Path | str | None = ...,
     no_contact: Path | str | None = ...,
     pipeline: Path | str | None = ...,
     force: bool = ...,
     progress: Progress | bool | None = ...,
-) -> Preprocessed: ...
+) -> TrainedRun: ...
 
-def realism(
-    path: Path | str,
-    *,
-    sensor: str | Path | SensorSpec,
-    out: Path | str,
-    pose_aligned: bool = ...,
-    max_frames: int | None = ...,
-    fitted: int = ...,
-    without: str | Sequence[str] | None = ...,
-    residual: bool = ...,
-    quality: Literal['rasterised', 'preview', 'standard', 'high'] = ...,
-    two_sample: bool = ...,
-    thorough: bool = ...,
-    table: Path | str | None = ...,
-    pipeline: Path | str | None = ...,
-    force: bool = ...,
-    progress: Progress | bool | None = ...,
-) -> Realism: ...
-
-def record(
+def collect(
     *,
     camera: str | Path,
-    out: Path | str,
-    count: int = ...,
-    port: int = ...,
-    force: bool = ...,
-    progress: Progress | bool | None = ...,
-) -> RecordedFrames: ...
-
-def robustness(
-    *,
+    arm: str,
     sensor: str | Path | SensorSpec,
     out: Path | str,
-    pipeline: str | Sequence[str] | None = ...,
-    model: Path | str | Sequence[Path | str] | None = ...,
-    conditions: Path | str | None = ...,
-    frames: Path | str | None = ...,
-    max_frames: int = ...,
-    rendered: bool = ...,
-    jobs: int = ...,
+    experiment: str | Path | ExperimentSpec = ...,
+    count: int = ...,
+    obj: str | Path | ObjectSpec | None = ...,
+    servo: str | Path | ServoSpec = ...,
+    form: Form | str | None = ...,
+    safety: str | None = ...,
+    seed: int | None = ...,
+    design: str = ...,
+    plain_light: bool = ...,
+    also: str | Sequence[str] | None = ...,
+    ros2: str | None = ...,
+    dry_run: bool = ...,
     force: bool = ...,
     progress: Progress | bool | None = ...,
-) -> DegradationResult: ...
+) -> Collected: ...
 
 def run_policy(
     policy: Path | str,
@@ -349,62 +408,3 @@ def servo(
     force: bool = ...,
     progress: Progress | bool | None = ...,
 ) -> Followed: ...
-
-def train(
-    *,
-    model: str,
-    sensor: str | Path | SensorSpec,
-    data: Path | str | Sequence[Path | str],
-    out: Path | str,
-    target: str | Sequence[str] = ...,
-    label_kind: str = ...,
-    seed: int = ...,
-    split: int = ...,
-    epochs: int | None = ...,
-    batch: int | None = ...,
-    members: int | None = ...,
-    kernel: bool | None = ...,
-    max_minutes: float | None = ...,
-    threads: int | None = ...,
-    device: str = ...,
-    form: Form | str | None = ...,
-    table: Path | str | None = ...,
-    no_contact: Path | str | None = ...,
-    pipeline: Path | str | None = ...,
-    force: bool = ...,
-    progress: Progress | bool | None = ...,
-) -> TrainedRun: ...
-
-def tune(
-    *,
-    sensor: str | Path | SensorSpec,
-    frames: Path | str,
-    out: Path | str | None = ...,
-    method: Literal['twin', 'legacy', 'adaptive', 'fixed', 'simple', 'log', 'dog', 'doh'] = ...,
-    form: Form | str | None = ...,
-    max_frames: int = ...,
-    table: Path | str | None = ...,
-    no_contact: Path | str | None = ...,
-    force: bool = ...,
-    progress: Progress | bool | None = ...,
-) -> TunedOnFrames: ...
-
-def validate(
-    *,
-    sensor: str | Path | SensorSpec,
-    frames: Path | str,
-    out: Path | str,
-    experiment: str | Path | ExperimentSpec = ...,
-    obj: str | Path | ObjectSpec | None = ...,
-    max_frames: int | None = ...,
-    friction_frames: int = ...,
-    seed: int = ...,
-    elements: int = ...,
-    form: Form | str | None = ...,
-    table: Path | str | None = ...,
-    no_contact: Path | str | None = ...,
-    pipeline: Path | str | None = ...,
-    column: str | Sequence[str] | None = ...,
-    force: bool = ...,
-    progress: Progress | bool | None = ...,
-) -> Validation | ForceComparison: ...

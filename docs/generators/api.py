@@ -168,8 +168,12 @@ def _list_exports(tree: ast.Module) -> dict[str, str]:
         for alias in node.names
     }
     assigned = {ast.unparse(target): node.value for node in tree.body if isinstance(node, ast.Assign) for target in node.targets}
-    if "_PLACES" in assigned:  # names that are imported when they are first used
-        return {name: place.replace(":", ".") for name, place in ast.literal_eval(assigned["_PLACES"]).items()}
+    if "_OFFERED" in assigned:  # names that are imported when they are first used
+        offered, renamed = (ast.literal_eval(assigned[name]) for name in ("_OFFERED", "_RENAMED"))
+        renamed = {name: place.replace(":", ".") for name, place in renamed.items()}
+        return dict(sorted(({name: place for place, names in offered.items() for name in names} | renamed).items()))
+    if "_PLACES" in assigned:
+        return dict(ast.literal_eval(assigned["_PLACES"]))
     only_imports = all(isinstance(node, ast.Expr | ast.ImportFrom) for node in tree.body)
     names = ast.literal_eval(assigned["__all__"]) if "__all__" in assigned else list(places) if only_imports else []
     return {name: places[name] for name in names if name in places}

@@ -250,6 +250,11 @@ class MG400(LinkageArm):
             if percent is not None:
                 self._ask(f"{name}({int(np.clip(np.floor(percent + 1e-9), 1, 100))})")
 
+    def set_output(self, index: int, on: bool) -> None:
+        """Set a digital output at once."""
+        self._require_connected()
+        self._ask(f"DOExecute({index},{int(on)})")
+
     @property
     def overall_percent(self) -> float:
         """``SpeedFactor`` in %, as feedback reports it."""

@@ -5,15 +5,17 @@ from hardware.arms.magician import Magician
 from hardware.arms.magician_wire import USB_VENDORS
 from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.arms.mg400_wire import DEFAULT_HOSTS, address_of
+from hardware.arms.ros2 import ARM_FORM, ros2_arm
 from hardware.arms.simulated import SimulatedArm
+from hardware.arms.ur.driver import UR
 from hardware.errors import DeviceError
 from scenes.files import quote
 from scenes.plugins import others
 
-KINDS = ("simulated", "mg400", "mg400-lenient", "magician")
+KINDS = ("simulated", "mg400", "mg400-lenient", "magician", "ros2", "ur")
 ARM_SPECS = (
     "mg400 or mg400:ADDRESS[:DASHBOARD_PORT] (an arm, or 127.0.0.1 with 'twin emulate mg400'), mg400-lenient:ADDRESS[:DASHBOARD_PORT] "
-    "(a controller that is not an MG400's), magician or magician:/dev/ttyUSB0, "
+    f"(a controller that is not an MG400's), magician or magician:/dev/ttyUSB0, {ARM_FORM}, ur:ADDRESS, "
     "simulated (six axes) or simulated:4"
 )
 
@@ -40,6 +42,10 @@ def open_arm(spec: str) -> Arm:
         return MG400(host or DEFAULT_HOSTS["LAN1"], ports=Mg400Ports().shift_ports(offset), lenient=kind == "mg400-lenient")
     if kind == "magician":
         return Magician(rest or _attached_magician())
+    if kind == "ros2":
+        return ros2_arm(rest)
+    if kind == "ur" and rest:
+        return UR(rest)
     there = others("arms", KINDS)
     if kind in there:
         arm: Arm = there[kind](rest)
@@ -48,7 +54,7 @@ def open_arm(spec: str) -> Arm:
 
 
 def kind_of(spec: str) -> str:
-    """The kind of an arm by its specification: ``mg400``, ``magician`` or ``simulated``."""
+    """The kind of an arm by its specification: ``mg400``, ``magician``, ``ros2``, ``ur`` or ``simulated``."""
     return spec.partition(":")[0].removesuffix("-lenient")
 
 

@@ -26,8 +26,6 @@ POLL_S = 0.03
 CHUNK = 65_536
 # Header of a part with the exposure in Unix seconds, in lower case, as mjpg-streamer sends it.
 TIME_HEADER = "x-timestamp"
-# Bytes in the send buffer of a server's connection. The kernel doubles the number, and the client has its own buffer.
-HELD_BYTES = 16_384
 # What to do about an answer, by its status.
 REMEDIES = {
     401: "it wants a login: give http://NAME:PASSWORD@HOST/..., with % codes for special characters; if you did, it refuses this one",
@@ -35,11 +33,6 @@ REMEDIES = {
     404: "it has no such page; look up the path of the stream in the camera's manual",
     503: "it is busy or not ready; end what else uses the camera, and try again",
 }
-
-
-def hold_little(connection: socket.socket) -> None:
-    """Limit a connection's buffer to few pictures, so that a client that pauses gets few old pictures, and then the newest."""
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, HELD_BYTES)
 
 
 def without_secrets(address: str) -> str:

@@ -1,18 +1,23 @@
-"""A page on this machine that shows a camera's newest picture, with a line of text above it."""
+"""A camera's newest picture over HTTP: as a stream (multipart/x-mixed-replace), and on a page with a line of text above it."""
 
+import socket
 import threading
+import time
+from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from types import TracebackType
 
 import cv2
 import numpy as np
 
 from hardware.cameras.coded import CONTENT_TYPE, jpeg_of, write_part
-from hardware.cameras.mjpeg import hold_little
 from hardware.errors import cannot_listen
 from twin.errors import ErrorsAs
 
 WAIT_S = 0.5
+"""Interval in s at which a connection without new pictures checks whether the server has ended."""
+HELD_BYTES = 16_384
+"""Bytes in the send buffer of a connection, so that a client that pauses gets few old pictures, and then the newest. The kernel doubles the
+number, and the client has its own buffer."""
 STREAM = "/stream.mjpg"
 PAGE = f"""<!doctype html><meta name=viewport content="width=device-width"><title>Camera</title>
 <body style="margin:0;background:#222;text-align:center"><img src="{STREAM}" style="max-width:100%" alt="the camera's picture">"""
@@ -20,7 +25,76 @@ LINE_PX, LETTER = 28, 0.6
 """Height of the line of text, px, and size of its letters, for OpenCV."""
 
 
-class PicturePage(ThreadingHTTPServer):
+@dataclass(frozen=True)
+class StreamPart:
+    """A picture as it is sent: its number from 1 on, bytes, further headers, and earliest time of sending (monotonic)."""
+
+    number: int
+    jpeg: bytes
+    headers: dict[str, object] = field(default_factory=dict)
+    due_s: float = 0.0
+
+
+class JpegServer(ThreadingHTTPServer):
+    """Sends the newest picture to every client, each in its own thread.
+
+    Parameters
+    ----------
+    who : str
+        Name of the server, for its threads and errors.
+    host : str
+    port : int
+        Port; 0 for a free one, see ``url``.
+
+    Attributes
+    ----------
+    page : str
+        Page at every address but that of the stream; "" if the stream is at all addresses.
+    url : str
+        Address of the page, or of the server.
+    """
+
+    page = ""
+
+    def __init__(self, who: str, host: str, port: int) -> None:
+        with ErrorsAs(OSError, lambda error: cannot_listen(who, host, port, error)):
+            super().__init__((host, port), _Handler)
+        self.url = f"http://{host}:{self.server_port}/"
+        self._new, self.newest, self.ended = threading.Condition(), StreamPart(0, b""), threading.Event()
+        self._thread = threading.Thread(target=self.serve_forever, name=who, daemon=True)
+
+    def start(self) -> None:
+        """Begin to serve."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End."""
+        self.ended.set()
+        if self._thread.is_alive():
+            self.shutdown()
+            self._thread.join()
+        self.server_close()
+
+    def give(self, part: StreamPart) -> None:
+        """Set the newest picture."""
+        with self._new:
+            self.newest = part
+            self._new.notify_all()
+
+    def await_part(self, after: int) -> StreamPart:
+        """The newest picture, as soon as its number is larger than ``after`` and it may be sent, or after a while."""
+        with self._new:
+            self._new.wait_for(lambda: self.newest.number > after, WAIT_S)
+            part = self.newest
+        self.ended.wait(max(0.0, part.due_s - time.monotonic()))
+        return part
+
+    def refuses(self) -> bool:
+        """Whether no client is served at present."""
+        return False
+
+
+class PicturePage(JpegServer):
     """A context manager; the page is served while it is entered.
 
     Parameters
@@ -29,64 +103,56 @@ class PicturePage(ThreadingHTTPServer):
         Port; 0 for a free one, see ``url``.
     """
 
-    daemon_threads = True
+    page = PAGE
 
     def __init__(self, port: int = 0) -> None:
-        with ErrorsAs(OSError, lambda error: cannot_listen("preview", "127.0.0.1", port, error)):
-            super().__init__(("127.0.0.1", port), _Handler)
-        self._new, self._number, self._jpeg, self.ended = threading.Condition(), 0, b"", False
-
-    @property
-    def url(self) -> str:
-        """Address of the page."""
-        return f"http://127.0.0.1:{self.server_port}/"
+        super().__init__("preview", "127.0.0.1", port)
 
     def __enter__(self) -> "PicturePage":
-        threading.Thread(target=self.serve_forever, name="preview", daemon=True).start()
+        self.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.ended = True
-        self.shutdown()
-        self.server_close()
+    def __exit__(self, *_: object) -> None:
+        self.stop()
 
     def show(self, image: np.ndarray, line: str) -> None:
         """Show a picture (H, W) or (H, W, 3), RGB, with a line of text."""
         text = np.zeros((LINE_PX, max(image.shape[1], 1), 3), np.uint8)
         cv2.putText(text, line, (6, LINE_PX - 9), cv2.FONT_HERSHEY_SIMPLEX, LETTER, (255, 255, 255), 1, cv2.LINE_AA)
         coloured = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
-        with self._new:
-            self._number, self._jpeg = self._number + 1, jpeg_of(np.vstack([text, coloured]))
-            self._new.notify_all()
-
-    def next_picture(self, after: int) -> tuple[int, bytes]:
-        """Number and JPEG of the newest picture, as soon as its number is larger than ``after``, or after a while."""
-        with self._new:
-            self._new.wait_for(lambda: self._number > after, WAIT_S)
-            return self._number, self._jpeg
+        self.give(StreamPart(self.newest.number + 1, jpeg_of(np.vstack([text, coloured]))))
 
 
 class _Handler(BaseHTTPRequestHandler):
-    server: PicturePage
+    server: JpegServer
+
+    def do_HEAD(self) -> None:
+        if self.server.refuses():
+            self.send_error(503, "unplugged")
+            return
+        self.send_response(200)
+        self.send_header("Content-Type", CONTENT_TYPE if self._streams else "text/html; charset=utf-8")
+        self.end_headers()
 
     def do_GET(self) -> None:
-        streams = self.path == STREAM
-        self.send_response(200)
-        self.send_header("Content-Type", CONTENT_TYPE if streams else "text/html; charset=utf-8")
-        self.end_headers()
-        if not streams:
-            self.wfile.write(PAGE.encode())
+        self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, HELD_BYTES)
+        self.do_HEAD()
+        if not self._streams:
+            self.wfile.write(self.server.page.encode())
             return
-        hold_little(self.connection)
         number = 0
-        while not self.server.ended:
-            newest, jpeg = self.server.next_picture(number)
-            if newest > number:
+        while not (self.server.ended.is_set() or self.server.refuses()):
+            part = self.server.await_part(number)
+            if part.number > number:
                 try:
-                    write_part(self.wfile, jpeg)
+                    write_part(self.wfile, part.jpeg, part.headers)
                 except OSError:
                     return
-            number = newest
+                number = part.number
+
+    @property
+    def _streams(self) -> bool:
+        return not self.server.page or self.path == STREAM
 
     def log_message(self, *_: object) -> None:
         """Write no log."""

@@ -68,7 +68,8 @@ class TwinCamera(LiveSource):
     Parameters
     ----------
     spec : SensorSpec
-    placed : PlacedObject
+    placed : PlacedObject or None
+        Not needed with ``world``.
     arm : callable
         The arm's newest state.
     form : Form
@@ -94,7 +95,7 @@ class TwinCamera(LiveSource):
     def __init__(
         self,
         spec: SensorSpec,
-        placed: PlacedObject,
+        placed: PlacedObject | None,
         arm: PoseSource,
         form: Form = Form.RAW,
         *,
@@ -122,7 +123,10 @@ class TwinCamera(LiveSource):
         if self._preview is None:
             self._preview = preview_of(self._spec, self.form)
         if self._world is None:
-            world = self._given or _AtPlacedObject(self._spec, self._placed)
+            world = self._given
+            if world is None:
+                assert self._placed is not None
+                world = _AtPlacedObject(self._spec, self._placed)
             world.warm_up()
             self._world = world
 

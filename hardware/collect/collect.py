@@ -316,14 +316,9 @@ def _collect_one(stops: "_Stops", experiment: ExperimentSpec, collection: Collec
     confirmed = stops.go(contact.pose + clear + tap)
     frame = stops.frame_after(confirmed)
     after = stops.mover.arm.state()
-    log = {
-        "asked": [*contact.pose.tolist(), *contact.move.tolist()],
-        "confirmed_pose": confirmed.pose.tolist(),
-        "confirmed_s": confirmed.time_s,
-        "frame_s": frame.time_s,
-        "sequence": frame.sequence,
-        "moved_meanwhile_mm": float(np.linalg.norm(after.pose[:3] - confirmed.pose[:3])),
-    }
+    moved_mm = float(np.linalg.norm(after.pose[:3] - confirmed.pose[:3]))
+    log = {"asked": [*contact.pose.tolist(), *contact.move.tolist()], "confirmed_pose": confirmed.pose.tolist()}
+    log |= {"confirmed_s": confirmed.time_s, "frame_s": frame.time_s, "sequence": frame.sequence, "moved_meanwhile_mm": moved_mm}
     collection.keep(index, frame, stops.work.label(confirmed.pose), contact.move, log)
     stops.frame_after(stops.go(contact.pose + clear + tap, LIFT_MM))
 
@@ -445,19 +440,8 @@ def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent)
         The frame without contact shows a contact, or not this sensor.
     """
     kept = KeptAlso(out, plan.also, plan.sensor)
-    rig = build_rig(
-        plan.sensor,
-        plan.obj,
-        plan.servo.placement,
-        plan.experiment,
-        camera=plan.camera,
-        arm=plan.arm,
-        form=plan.form,
-        limits=plan.limits,
-        seed=plan.sampling_seed,
-        plain_light=plan.plain_light,
-        at_once=True,
-    )
+    devices = {key: getattr(plan, key) for key in ("camera", "arm", "form", "limits", "plain_light")}
+    rig = build_rig(plan.sensor, plan.obj, plan.servo.placement, plan.experiment, **devices, seed=plan.sampling_seed, at_once=True)
     collection = Collection(out, _about(plan, rig), rig.source.form)
     before = collection.count
 
@@ -488,37 +472,24 @@ def _say_plan(plan: CollectPlan, rig: Rig, made: int) -> None:
     """Check the plan and report it. Of the contacts the next ``CHECKED_CONTACTS`` are checked."""
     work, near = WorkFrame(plan.experiment, rig.placed), rig.arm.state().pose
     pressed = np.array(plan.experiment.clear) + np.array(plan.experiment.tap)
-    contacts = [
-        draw_contact(plan.experiment, plan.sampling_seed, n, plan.design) for n in range(made, min(plan.count, made + CHECKED_CONTACTS))
-    ]
+    numbers = range(made, min(plan.count, made + CHECKED_CONTACTS))
+    contacts = [draw_contact(plan.experiment, plan.sampling_seed, number, plan.design) for number in numbers]
     planned = [work.base_pose(one.pose + pressed, near) for one in contacts]
     clear = work.base_pose(np.zeros(6), near, away_mm=CLEAR_MM)
     spent_s = (plan.count - made) * CONTACT_S
-    form = rig.source.form
-    at_rest = partial(measure_reference, plan.sensor, form)
-    lines = check_plan(
-        rig, Pipeline(plan.sensor, form), clear, planned, linear_mm_s=plan.servo.linear_mm_s, spent_s=spent_s, at_rest=at_rest
-    )
-    for line in lines:
+    pipeline, at_rest = Pipeline(plan.sensor, rig.source.form), partial(measure_reference, plan.sensor, rig.source.form)
+    for line in check_plan(rig, pipeline, clear, planned, linear_mm_s=plan.servo.linear_mm_s, spent_s=spent_s, at_rest=at_rest):
         LOGGER.warning("%s", line)
 
 
 def _about(plan: CollectPlan, rig: Rig) -> dict[str, Any]:
     """Everything that the frames depend on. A collection is continued only if all of this is the same."""
     low, high = zip(*plan.experiment.ranges().values(), strict=True)
-    return {
-        "comments": f"collected: {plan.experiment.name}, {plan.sensor.name}, {plan.obj.name}",
-        "camera": without_secrets(plan.camera),
-        "arm": plan.arm,
-        "sensor": plan.sensor.name,
-        "form": str(rig.source.form),
-        "seed": plan.sampling_seed,
-        "experiment": plan.experiment.model_dump(mode="json"),
-        "placement": plan.servo.placement.model_dump(mode="json"),
-        "tap_move": plan.experiment.tap,
-        "poses_rng": [high[:6], low[:6]],
-        "moves_rng": [high[6:], low[6:]],
-        "linear_speed": plan.servo.linear_mm_s,
-        "angular_speed": plan.servo.angular_deg_s,
-        **({} if plan.design == "random" else {"design": plan.design}),  # left out for "random", so that older collections can be continued
-    }
+    about: dict[str, Any] = {"comments": f"collected: {plan.experiment.name}, {plan.sensor.name}, {plan.obj.name}"}
+    about |= {"camera": without_secrets(plan.camera), "arm": plan.arm, "sensor": plan.sensor.name, "form": str(rig.source.form)}
+    about |= {"seed": plan.sampling_seed, "experiment": plan.experiment.model_dump(mode="json")}
+    about |= {"placement": plan.servo.placement.model_dump(mode="json"), "tap_move": plan.experiment.tap}
+    about |= {"poses_rng": [high[:6], low[:6]], "moves_rng": [high[6:], low[6:]]}
+    about |= {"linear_speed": plan.servo.linear_mm_s, "angular_speed": plan.servo.angular_deg_s}
+    # left out for "random", so that older collections can be continued
+    return about | ({} if plan.design == "random" else {"design": plan.design})

@@ -2,19 +2,16 @@
 
 import threading
 import time
-from dataclasses import dataclass
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 
-from hardware.cameras.coded import CONTENT_TYPE, jpeg_of, write_part
-from hardware.cameras.mjpeg import hold_little
+from hardware.cameras.coded import jpeg_of
+from hardware.cameras.picture_page import STREAM, WAIT_S, JpegServer, StreamPart
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.emulators.faults import EVERY_NTH, SECONDS, Emulator, Fault, Faults
-from hardware.errors import DeviceError, cannot_listen
-from twin.errors import ErrorsAs, TwinError
+from hardware.errors import DeviceError
+from twin.errors import TwinError
 
-CLIENT_WAIT_S = 0.5
 FAULTS = {
     "frozen": Fault("the same picture again and again"),
     "black": Fault("the lamps are off"),
@@ -27,14 +24,18 @@ FAULTS = {
 }
 
 
-@dataclass(frozen=True)
-class _Part:
-    """A picture as it is sent: number, exposure (Unix seconds), earliest time of sending (monotonic), bytes."""
+class _Server(JpegServer):
+    """The camera's server, and the fault that cuts its connections."""
 
-    number: int
-    exposed_unix_s: float
-    due_s: float
-    jpeg: bytes
+    def __init__(self, faults: Faults, host: str, port: int) -> None:
+        super().__init__("camera emulator", host, port)
+        self._faults, self._pulled_s = faults, 0.0
+
+    def refuses(self) -> bool:
+        """See ``JpegServer``: the camera is unplugged by a fault at present."""
+        span_s = self._faults.value("unplugged")
+        self._pulled_s = 0.0 if span_s is None else self._pulled_s or time.monotonic()
+        return span_s is not None and time.monotonic() - self._pulled_s < span_s
 
 
 class CameraEmulator(Emulator):
@@ -52,79 +53,48 @@ class CameraEmulator(Emulator):
 
     Attributes
     ----------
-    made, sent : int
-        Number of pictures so far, including lost ones, and number of parts sent to any client.
+    made : int
+        Number of pictures so far, including lost ones.
     """
 
     def __init__(self, source: FrameSource, *, host: str = "127.0.0.1", port: int = 0, faults: tuple[str, ...] = ()) -> None:
         self.faults = Faults(FAULTS, faults)
         self._source, self._address = source, (host, port)
-        self._new = threading.Condition()
-        self._part: _Part | None = None
-        self._end = threading.Event()
-        self._threads: list[threading.Thread] = []
-        self._server: ThreadingHTTPServer | None = None
-        self._pulled_s: float | None = None
+        self._running: tuple[_Server, threading.Thread] | None = None
         self.error: Exception | None = None
-        self.made = self.sent = 0
+        self.made = 0
 
     @property
     def url(self) -> str:
         """Address of the stream."""
-        if self._server is None:
+        if self._running is None:
             raise DeviceError("camera emulator: not started; call start() first")
-        return f"http://{self._address[0]}:{self._server.server_port}/stream.mjpg"
+        return f"{self._running[0].url}{STREAM[1:]}"
 
     def start(self) -> None:
-        with ErrorsAs(OSError, lambda error: cannot_listen("camera emulator", *self._address, error)):
-            self._server = _Server(self._address, _handler_of(self))
-        self._end.clear()
+        server = _Server(self.faults, *self._address)
         self._source.connect()
         try:
             await_frame(self._source)  # the first frame compiles kernels, so it is made before a client can connect
         except BaseException:
-            self._server.server_close()
+            server.stop()
             self._source.disconnect()
             raise
-        for target in (self._make, self._server.serve_forever):
-            self._threads.append(threading.Thread(target=target, name="camera emulator", daemon=True))
-            self._threads[-1].start()
+        self._running = server, threading.Thread(target=self._make, args=(server,), name="camera emulator", daemon=True)
+        server.start()
+        self._running[1].start()
 
     def stop(self) -> None:
-        self._end.set()
-        if self._server is not None:
-            self._server.shutdown()
-            self._server.server_close()
-        for thread in self._threads:
-            thread.join(timeout=15.0)
-        self._threads.clear()
+        if self._running is not None:
+            self._running[0].stop()
+            self._running[1].join(timeout=15.0)
         self._source.disconnect()
 
-    @property
-    def pulled_out(self) -> bool:
-        """Whether the camera is unplugged by a fault at present."""
-        span_s = self.faults.value("unplugged")
-        if span_s is None:
-            self._pulled_s = None
-            return False
-        self._pulled_s = self._pulled_s or time.monotonic()
-        return time.monotonic() - self._pulled_s < span_s
-
-    def next_part(self, after: int) -> _Part | None:
-        """The newest part with a number larger than ``after``, as soon as it may be sent; None if none comes for a while."""
-        with self._new:
-            self._new.wait_for(lambda: self._part is not None and self._part.number > after, CLIENT_WAIT_S)
-            part = self._part
-        if part is None or part.number <= after:
-            return None
-        self._end.wait(max(0.0, part.due_s - time.monotonic()))
-        return part
-
-    def _make(self) -> None:
+    def _make(self, server: _Server) -> None:
         last: np.ndarray | None = None
-        while not self._end.is_set():
+        while not server.ended.is_set():
             try:
-                frame = self._source.read(timeout_s=CLIENT_WAIT_S)
+                frame = self._source.read(timeout_s=WAIT_S)
             except TimeoutError:
                 continue
             except (TwinError, EOFError) as error:
@@ -145,44 +115,5 @@ class CameraEmulator(Emulator):
             if self.faults.every("torn", self.made):
                 jpeg = jpeg[: len(jpeg) // 2]
             age_s = time.monotonic() - frame.time_s
-            part = _Part(self.made, time.time() - age_s, time.monotonic() + (self.faults.value("late") or 0.0), jpeg)
-            with self._new:
-                self._part = part
-                self._new.notify_all()
-
-
-class _Server(ThreadingHTTPServer):
-    daemon_threads = True
-    allow_reuse_address = True
-
-
-def _handler_of(camera: CameraEmulator) -> type[BaseHTTPRequestHandler]:
-    class Handler(BaseHTTPRequestHandler):
-        def do_HEAD(self) -> None:
-            if camera.pulled_out:
-                self.send_error(503, "unplugged")
-                return
-            self.send_response(200)
-            self.send_header("Content-Type", CONTENT_TYPE)
-            self.end_headers()
-
-        def do_GET(self) -> None:
-            hold_little(self.connection)
-            self.do_HEAD()
-            number = 0
-            while not (camera._end.is_set() or camera.pulled_out):
-                part = camera.next_part(number)
-                if part is None:
-                    continue
-                number = part.number
-                headers = {"X-Timestamp": f"{part.exposed_unix_s:.6f}", "X-Sequence": part.number}
-                try:
-                    write_part(self.wfile, part.jpeg, headers)
-                except OSError:
-                    return
-                camera.sent += 1
-
-        def log_message(self, *_: object) -> None:
-            """Write no log."""
-
-    return Handler
+            headers = {"X-Timestamp": f"{time.time() - age_s:.6f}", "X-Sequence": self.made}
+            server.give(StreamPart(self.made, jpeg, headers, time.monotonic() + (self.faults.value("late") or 0.0)))

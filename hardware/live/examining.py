@@ -130,10 +130,8 @@ def _write_page(folder: Path, found: Examination, frames: list[Frame], pipeline:
     paths = [folder / f"frame-{k + 1}.png" for k in range(len(shown))]
     for path, frame in zip(paths, shown, strict=True):
         write_image(path, draw_overlay(frame, pipeline(frame), scale=2))
-    page.figures(
-        *(PagePicture(path, f"Frame {frame.name} with its pins", frame.name) for path, frame in zip(paths, shown, strict=True)),
-        layout="row",
-    )
+    pictures = (PagePicture(path, f"Frame {frame.name} with its pins", frame.name) for path, frame in zip(paths, shown, strict=True))
+    page.figures(*pictures, layout="row")
     page.write(folder / "index.html")
 
 

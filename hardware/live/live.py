@@ -138,14 +138,8 @@ class LiveSession:
 
 def estimate_line(estimate: Estimate) -> dict:
     """An estimate in the form in which a session stores it."""
-    return {
-        "names": list(estimate.names),
-        "value": np.asarray(estimate.value),
-        "low": np.asarray(estimate.low),
-        "high": np.asarray(estimate.high),
-        "valid": bool(estimate.valid),
-        "reason": estimate.reason,
-    }
+    numbers = {key: np.asarray(getattr(estimate, key)) for key in ("value", "low", "high")}
+    return {"names": list(estimate.names)} | numbers | {"valid": bool(estimate.valid), "reason": estimate.reason}
 
 
 def same_estimates(steps: list[dict], values: list[np.ndarray]) -> int:

@@ -55,6 +55,11 @@ class WatchedArm:
     pipeline : Pipeline, optional
         Finds the pins of the sensor in the camera's frames.
 
+    Attributes
+    ----------
+    armed : bool
+        Whether the page may move the arm.
+
     Raises
     ------
     DeviceError
@@ -65,16 +70,11 @@ class WatchedArm:
         arm, kind = open_arm(text), kind_of(text)
         self._arm = SafeArm(arm, load_limits(kind))
         self.name = self._arm.name
-        self._armed = False
+        self.armed = False
         self._moves = threading.Lock()
         self._source, self._pipeline = source, pipeline
         self._eyes = FreshFrames(self._arm, source) if source is not None else None
         self._steps: list[tuple[int, float]] = []  # axis and length of the steps from the pose at which it was armed
-
-    @property
-    def armed(self) -> bool:
-        """Whether the page may move the arm."""
-        return self._armed
 
     def connect(self) -> None:
         """Open the connection. Nothing moves."""
@@ -111,12 +111,12 @@ class WatchedArm:
         self._steps.clear()
         self._arm.enable()
         self._arm.set_speed(SLOW_MM_S, SLOW_DEG_S)
-        self._armed = True
+        self.armed = True
         return checked
 
     def disarm(self) -> None:
         """Stop and disable the arm. Both are tried."""
-        self._armed = False
+        self.armed = False
         if failed := try_each(stop=self._arm.stop, disable=self._arm.disable):
             raise DeviceError(f"{self.name}: {'; '.join(failed)}; use its own stop button")
 
@@ -128,7 +128,7 @@ class WatchedArm:
         DeviceError
             The arm is not armed, is already moving, its limits forbid the move, or the camera gives no fresh frame.
         """
-        if not self._armed or self._eyes is None:
+        if not self.armed or self._eyes is None:
             raise DeviceError(f"{self.name}: read only; arm it first")
         if not self._moves.acquire(blocking=False):
             raise DeviceError(f"{self.name}: is already moving; wait until it stops")
@@ -149,12 +149,12 @@ class WatchedArm:
 
     def emergency_stop(self) -> None:
         """Stop the arm and cut its power."""
-        self._armed = False
+        self.armed = False
         self._arm.emergency_stop()
 
     def close(self) -> None:
         """Disarm the arm if it is armed, and close the connection."""
-        if self._armed:
+        if self.armed:
             with suppress(DeviceError):
                 self.disarm()
         self._arm.disconnect()

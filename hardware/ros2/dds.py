@@ -127,9 +127,9 @@ class Reader:
         """Whether anybody writes the topic."""
         return bool(self._reader.get_matched_publications())
 
-    def take(self) -> list[bytes]:
-        """The messages that came since the last call, the oldest first. It waits at most ``WAIT_S`` for one."""
-        self._waits.wait(round(1e9 * WAIT_S))
+    def take(self, wait_s: float = WAIT_S) -> list[bytes]:
+        """The messages that came since the last call, the oldest first. It waits at most ``wait_s`` for one."""
+        self._waits.wait(round(1e9 * wait_s))
         found = self._take(self._reader._ref, self._states, KEPT_SENSOR)
         return [] if isinstance(found, int) else [bytes(data) for data, info in found if info.valid_data]
 

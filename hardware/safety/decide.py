@@ -4,6 +4,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -285,11 +286,8 @@ def decide(
         return refused
     if kinematics is not None and (refused := _joints(pose, state.pose, limits, kinematics)):
         return refused
-    if shortened:
-        return Decision(
-            Action.MOVE, DecisionCode.STEP_SHORTENED, f"shortened to a step of {limits.step_mm} mm, {limits.step_deg} deg", pose
-        )
-    return Decision(Action.MOVE, DecisionCode.OK, "", pose)
+    why = f"shortened to a step of {limits.step_mm} mm, {limits.step_deg} deg" if shortened else ""
+    return Decision(Action.MOVE, DecisionCode.STEP_SHORTENED if shortened else DecisionCode.OK, why, pose)
 
 
 def clip(target: np.ndarray, start: np.ndarray, limits: SafetyLimits, kinematics: Kinematics | None = None) -> np.ndarray:
@@ -353,12 +351,7 @@ def shorten(start: np.ndarray, target: np.ndarray, limits: SafetyLimits, *, unwr
     return (start + min(shares) * way, True) if shares else (target.copy(), False)
 
 
-def _refuse(code: DecisionCode, reason: str) -> Decision:
-    return Decision(Action.REFUSE, code, reason)
-
-
-def _hold(code: DecisionCode, reason: str) -> Decision:
-    return Decision(Action.HOLD, code, reason)
+_refuse, _hold = partial(Decision, Action.REFUSE), partial(Decision, Action.HOLD)
 
 
 def _halt(state: ArmState, limits: SafetyLimits, *, now_s: float, sensed: Sensed | None) -> Decision | None:

@@ -240,7 +240,9 @@ def follow(
         model = model.at_rest(rest)
     elif plan.at_rest != FIRST:
         model = model.seeking_rest()
-    rig = _rig_of(plan, model)
+    devices = {key: getattr(plan, key) for key in ("camera", "arm", "limits", "seed", "plain_light")} | {"form": model.form}
+    experiment, at_once = load_experiment(plan.servo.experiment), plan.stream_hz is None
+    rig = build_rig(model.sensor, plan.obj, plan.servo.placement, experiment, **devices, at_once=at_once)
     round_steps, wanted_mm = steps_round(rig.placed, plan.servo, 1.0)
     steps = plan.steps or round_steps
     if plan.steps:
@@ -297,22 +299,6 @@ def steps_round(placed: PlacedObject, servo: ServoSpec, rounds: float) -> tuple[
     return int(np.ceil(way_mm / servo.feed_mm)), rounds * length_mm
 
 
-def _rig_of(plan: FollowPlan, model: SensorModel) -> Rig:
-    return build_rig(
-        model.sensor,
-        plan.obj,
-        plan.servo.placement,
-        load_experiment(plan.servo.experiment),
-        camera=plan.camera,
-        arm=plan.arm,
-        form=model.form,
-        limits=plan.limits,
-        seed=plan.seed,
-        plain_light=plan.plain_light,
-        at_once=plan.stream_hz is None,
-    )
-
-
 def _result_entries(plan: FollowPlan, model: SensorModel) -> dict[str, Any]:
     """The entries that are stored with the results."""
     names = {"sensor": model.sensor.name, "object": plan.obj.name, "camera": without_secrets(plan.camera), "arm": plan.arm}
@@ -343,7 +329,7 @@ def _say_turns(rig: Rig, servo: ServoSpec, wanted_mm: float) -> None:
 
 def _note_step(session: SessionWriter | None, step: Step, steps: int, record: StepRecord, frame: Frame, estimate: Estimate) -> None:
     if session is not None:
-        session.append(frame, record.plain())
+        session.append(frame, asdict(record))
     step(record.index + 1, steps)
 
 
@@ -364,13 +350,8 @@ def _results(plan: FollowPlan, rig: Rig, loop: ServoLoop, wanted_mm: float, fail
 
 def _write(out: Path, plan: FollowPlan, model: SensorModel, followed: Followed, entries: dict[str, Any]) -> list[Path]:
     title, (lead, *lines) = f"{plan.obj.name}, {model.sensor.name}", followed.lines()
-    content = {
-        **entries,
-        "measures": asdict(followed.measures),
-        "timing": asdict(followed.timing),
-        "failure": followed.failure,
-        "notes": followed.notes,
-    }
+    content = entries | {"measures": asdict(followed.measures), "timing": asdict(followed.timing)}
+    content |= {"failure": followed.failure, "notes": followed.notes}
     files = [write_csv(out / "trajectory.csv", followed.path), write_json(out / "measures.json", plain(content))]
     draw = partial(trajectory_figure, followed.path, followed.measures, title, outline_mm=followed.outline_mm)
     picture = write_chart(out / "trajectory.png", draw)
@@ -425,11 +406,8 @@ class ServoStudy(ReadableResult):
     @property
     def rows(self) -> list[dict[str, Any]]:
         """``model``, ``object``, every measure and ``failure`` of each run that made a step."""
-        return [
-            {"model": model, "object": name, **asdict(run.measures), "failure": run.failure}
-            for (model, name), run in self.found.items()
-            if isinstance(run, Followed)
-        ]
+        runs = [(key, run) for key, run in self.found.items() if isinstance(run, Followed)]
+        return [{"model": model, "object": name, **asdict(run.measures), "failure": run.failure} for (model, name), run in runs]
 
     def lines(self) -> list[str]:
         """The comparison as a table in plain text."""

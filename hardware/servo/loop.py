@@ -323,10 +323,8 @@ class ServoLoop:
             ("deg from the normal", reading.angle_deg, self.servo.plausible_deg),
         ):
             if not low <= got <= high:
-                return (
-                    reading,
-                    f"the model estimates {got:.1f} {name}, outside the possible [{low:g}, {high:g}]; give another model or sensor",
-                )
+                possible = f"outside the possible [{low:g}, {high:g}]; give another model or sensor"
+                return reading, f"the model estimates {got:.1f} {name}, {possible}"
         return reading, ""
 
     def _hold(self, reason: str, problem: Exception | None, age_s: float = float("nan")) -> None:

@@ -1,8 +1,7 @@
 """Settings and hooks of a servo loop, and the record of each of its steps."""
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -64,10 +63,6 @@ class StepRecord:
     exposed_pose: np.ndarray
     joints_deg: np.ndarray
     sent: np.ndarray
-
-    def plain(self) -> dict[str, Any]:
-        """The record as a dict, as a session stores it."""
-        return asdict(self)
 
 
 @dataclass(frozen=True)

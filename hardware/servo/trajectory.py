@@ -231,14 +231,8 @@ def trajectory_figure(path: Trajectory, measures: Measures, title: str, *, outli
     """
     slopes = local_slopes(path.tool_mm)
     rough = bool(np.isfinite(slopes).any())
-    courses = [
-        (estimated, true, name)
-        for estimated, true, name in (
-            (path.depth_mm, path.true_depth_mm, "depth, mm"),
-            (path.angle_deg, path.true_angle_deg, "angle from the normal, deg"),
-        )
-        if np.isfinite([estimated, true]).any()
-    ]
+    both = (path.depth_mm, path.true_depth_mm, "depth, mm"), (path.angle_deg, path.true_angle_deg, "angle from the normal, deg")
+    courses = [course for course in both if np.isfinite(course[:2]).any()]
     panels = 1 + rough + len(courses)
     figure, axes = new_figure(min(panels, 2), -(-panels // 2), panel_inch=4.6)
     figure.suptitle(title)
@@ -258,10 +252,8 @@ def trajectory_figure(path: Trajectory, measures: Measures, title: str, *, outli
         axes[1].set(xlim=(x - ZOOM_MM, x + ZOOM_MM), ylim=(y - ZOOM_MM, y + ZOOM_MM))
         axes[1].set_title(f"roughest: local S {slopes[worst]:.3f} (mean {measures.local_smoothness:.3f})")
     for ax, (estimated, true, name) in zip(axes[1 + rough :], courses, strict=False):
-        for values, style in (
-            (true, {"color": muted_colour(), "lw": 2, "label": "true"}),
-            (estimated, {"color": FELT, "label": "estimated"}),
-        ):
+        styles: list[dict] = [{"color": muted_colour(), "lw": 2, "label": "true"}, {"color": FELT, "label": "estimated"}]
+        for values, style in zip((true, estimated), styles, strict=True):
             if np.isfinite(values).any():
                 ax.plot(np.arange(len(values)), values, **style)
         ax.set(xlabel="step", ylabel=name)

@@ -315,6 +315,4 @@ def _contact_pose(header: dict[str, Any], names: tuple[str, ...], numbers: np.nd
             k = _POSE[name]
             pose[k], unit = value, 1 / ros.MM_PER_M if k < 3 else np.radians(1.0)
             variance[k] = ((high - low) * unit / SD_90) ** 2
-    place = ros.transform(matrix_of(pose), header, "")["transforms"][0]["transform"]
-    found = {"position": place["translation"], "orientation": place["rotation"]}
-    return {"header": header, "pose": {"pose": found, "covariance": np.diag(variance).ravel()}}
+    return {"header": header, "pose": {"pose": ros.place(matrix_of(pose)), "covariance": np.diag(variance).ravel()}}

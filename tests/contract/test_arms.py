@@ -1,4 +1,4 @@
-"""One contract for every arm: simulated, MG400 over TCP, Magician over a pseudo-terminal."""
+"""One contract for every arm: simulated, MG400 over TCP, Magician over a pseudo-terminal, UR through its client, any over ROS 2."""
 
 import time
 
@@ -50,6 +50,18 @@ class TestMagician(OfBench):
     kind = "magician"
 
 
+class TestRos2ArmOfTwists(OfBench):
+    kind = "ros2-twist"
+
+
+class TestRos2ArmOfPoses(OfBench):
+    kind = "ros2-pose"
+
+
+class TestUr(OfBench):
+    kind = "ur"
+
+
 @pytest.fixture(params=ARMS)
 def at(request):
     with bench(request.param) as at:
@@ -73,6 +85,10 @@ def test_a_move_to_where_it_is_returns_soon(ready):
 
 def test_joints_move_too(ready):
     joints = ready.arm.state().joints_deg + 2.0
+    if ready.arm.name.startswith("ROS 2"):
+        with pytest.raises(DeviceError, match="use move_linear"):
+            ready.arm.move_joints(joints)
+        return
     assert np.allclose(ready.arm.move_joints(joints), joints)
     assert np.allclose(ready.arm.state().joints_deg, joints, atol=0.01)
 
@@ -107,6 +123,8 @@ def test_a_target_farther_than_any_arm_reaches_is_told_at_once(ready, far):
     safe = SafeArm(ready.arm, load_limits("simulated").model_copy(update={"joints_deg": None}))
     for arm in (ready.arm, safe):
         for move, count in ((arm.move_joints, arm.axes), (arm.move_linear, 6)):
+            if arm is safe and arm.kinematics is None and move == arm.move_joints:
+                continue  # SafeArm refuses it for that reason
             with pytest.raises(DeviceError, match="farther than any arm reaches; give mm and deg"):
                 move([*[0.0] * (count - 1), far], wait=False)
     assert time.monotonic() - begun < 2.0
@@ -166,7 +184,12 @@ def test_speed_is_at_most_what_was_asked(ready):
 
 
 @pytest.mark.parametrize(
-    ("spec", "remedy"), [("mg400:127.0.0.1:1", "twin emulate mg400"), ("magician:/dev/no-such-port", "twin emulate magician")]
+    ("spec", "remedy"),
+    [
+        ("mg400:127.0.0.1:1", "twin emulate mg400"),
+        ("magician:/dev/no-such-port", "twin emulate magician"),
+        ("ros2:twist,namespace=no/one", "twin emulate ros2"),
+    ],
 )
 def test_what_is_not_there_is_one_clear_error(spec, remedy):
     arm = open_arm(spec)  # opens nothing yet
@@ -175,9 +198,11 @@ def test_what_is_not_there_is_one_clear_error(spec, remedy):
     assert not arm.is_connected
 
 
-@pytest.mark.parametrize("spec", ["", "ur5", "simulated:5", "mg400:host:port", "mg400:127.0.0.1:65535", "mg400:127.0.0.1:0"])
+@pytest.mark.parametrize(
+    "spec", ["", "ur5", "simulated:5", "mg400:host:port", "mg400:127.0.0.1:65535", "mg400:127.0.0.1:0", "ros2", "ros2:twist,topic=/a"]
+)
 def test_what_is_no_arm_names_those_that_are(spec):
-    with pytest.raises(DeviceError, match="mg400"):
+    with pytest.raises(DeviceError, match="mg400|ros2:twist"):
         open_arm(spec)
 
 

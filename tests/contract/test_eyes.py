@@ -53,6 +53,18 @@ def test_a_fault_in_a_phase_stops_a_magician(seed):
     assert not found.wrong(), found
 
 
+@pytest.mark.parametrize("seed", range(0, 4 * len(FAULTS), 7))
+def test_a_fault_in_a_phase_stops_an_arm_behind_ros_2(seed):
+    found = measure(seed, kind=("ros2-twist", "ros2-pose")[seed % 2])
+    assert not found.wrong(), found
+
+
+@pytest.mark.parametrize("seed", range(2, 4 * len(faults_of("ur")), 7))
+def test_a_fault_in_a_phase_stops_a_ur(seed):
+    found = measure(seed, kind="ur")
+    assert not found.wrong(), found
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_healthy_run_comes_to_its_end(command, kind):
@@ -67,7 +79,7 @@ def all_of(cases):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "count"), [("mg400", RUNS), ("magician", RUNS // 4)])
+@pytest.mark.parametrize(("kind", "count"), [("mg400", RUNS), ("magician", RUNS // 4), ("ur", RUNS // 4)])
 def test_no_fault_in_any_phase_goes_on(kind, count):
     runs = all_of([(seed, draw(seed, kind), kind) for seed in range(count)])
     print(f"\n{len(runs)} runs with a {kind}, seeds 0 to {count - 1}\n{table(runs)}")

@@ -7,7 +7,7 @@ import pytest
 from fault_phases import CASES, LIMIT_S, PHASES, measure
 
 HANG_S = 2.0  # of a call, beyond the time that it was given
-SOME = ("no-move-reply", "frozen", "collision", "mute")
+SOME = ("no-move-reply", "frozen", "collision", "mute", "silent", "protective-stop")
 
 
 def check(case):

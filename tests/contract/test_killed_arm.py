@@ -38,13 +38,13 @@ def survive(kind, seed):
 
 
 @pytest.mark.parametrize("seed", range(7))
-@pytest.mark.parametrize("kind", ["mg400", "mg400-old", "magician"])
+@pytest.mark.parametrize("kind", ["mg400", "mg400-old", "magician", "ur"])
 def test_killed_at_a_random_moment(kind, seed):
     survive(kind, seed)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(100, 167))
-@pytest.mark.parametrize("kind", ["mg400", "mg400-old", "magician"])
+@pytest.mark.parametrize("kind", ["mg400", "mg400-old", "magician", "ur"])
 def test_killed_at_many_random_moments(kind, seed):
     survive(kind, seed)

@@ -1,7 +1,7 @@
 """The loop over a simulated arm and a live source: it follows, it measures, and whatever goes wrong it stops and lets go."""
 
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -325,7 +325,7 @@ def test_a_replayed_session_decides_the_same(rig, tmp_path):
 
     with arm, NoisyCamera() as source, SessionWriter(tmp_path / "s", {"camera": source.name}) as session:
         loop = loop_of(rig, source, 12, estimator=of_picture)
-        loop.hooks = LoopHooks(on_step=lambda record, frame, estimate: session.append(frame, record.plain()))
+        loop.hooks = LoopHooks(on_step=lambda record, frame, estimate: session.append(frame, asdict(record)))
         loop.run(start(rig))
     live, estimates = np.array(estimates), []
     with SessionSource(tmp_path / "s") as replayed:

@@ -4,6 +4,7 @@ Arm and camera are emulated: an MG400 on its ports or a Magician on a serial lin
 from its seed.
 """
 
+import os
 import random
 import subprocess
 import sys
@@ -23,12 +24,16 @@ from true_estimator import TrueEstimator
 
 from hardware.arms.magician import Magician
 from hardware.arms.mg400 import MG400, Mg400Ports
+from hardware.arms.ros2 import Ros2Arm
+from hardware.arms.ur.driver import UR
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.reader import DevicePicture
 from hardware.collect.collect import Collection, collect
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.magician import MagicianEmulator
 from hardware.emulators.mg400 import Mg400Emulator
+from hardware.emulators.ros2 import Ros2Emulator
+from hardware.emulators.ur import UrEmulator
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject, shift_in_tool
 from hardware.safety.decide import SafetyLimits
@@ -56,7 +61,21 @@ ARM_FAULTS = {
 }
 # A Magician sends nothing unasked, so that its feedback and its replies are the same, and a reply that comes 2 s late is lost.
 SERIAL_FAULTS = {"feedback dead": ("mute",), "feedback garbled": ("wrong-checksum=1",)}
-KINDS = {"mg400": ("surface", ARM_FAULTS), "magician": ("magician", SERIAL_FAULTS)}
+UR_FAULTS = {"feedback dead": ("silent",), "feedback frozen": ("frozen-feedback",), "replies lost": ("no-replies",), "link lost": ()}
+# No reply belongs to a command of ROS 2, so that lost commands are what lost replies are elsewhere.
+TOPIC_FAULTS = {
+    "feedback dead": ("silent-feedback",),
+    "feedback 2 s late": ("late-feedback=2",),
+    "feedback garbled": ("jump=50", "frozen"),
+    "replies lost": ("ignore-commands",),
+}
+KINDS = {
+    "mg400": ("surface", ARM_FAULTS),
+    "magician": ("magician", SERIAL_FAULTS),
+    "ur": ("ur5", UR_FAULTS),
+    "ros2-twist": ("surface", TOPIC_FAULTS),
+    "ros2-pose": ("surface", TOPIC_FAULTS),
+}
 KILLED, HEALTHY = "program killed", "healthy"
 FAULTS = (*CAMERA_FAULTS, *ARM_FAULTS, KILLED)
 PHASES = ("standing", "approach", "near", "contact")
@@ -154,11 +173,18 @@ def placed_can(kind: str) -> PlacedObject:
 
 
 def program(
-    kind: str, command: str, place: tuple[int, ...] | str, url: str, folder: Path, pose=None, *, steps: int = STEPS
+    kind: str, command: str, place: tuple[int, ...] | str, url: str, folder: Path, pose=None, *, steps: int = STEPS, stops=None
 ) -> Callable[[], None]:
-    """What runs the command with an arm at its ports or at its serial line."""
+    """What runs the command with an arm at its ports, at its serial line or in its namespace of topics."""
     placed, servo = placed_can(kind), load_servo(KINDS[kind][0]).model_copy(update={"clear_mm": CLEAR_MM})
-    device = Magician(place) if kind == "magician" else MG400("127.0.0.1", ports=Mg400Ports(place[0], place[1], tuple(place[2:])))
+    if kind.startswith("ros2"):
+        device = Ros2Arm(kind[5:], namespace=place)
+        hold = device._hold
+        device._hold = lambda *why, **how: (stops is not None and stops.append(time.monotonic()), hold(*why, **how))
+    elif kind == "mg400":
+        device = MG400("127.0.0.1", ports=Mg400Ports(place[0], place[1], tuple(place[2:])))
+    else:
+        device = UR(place) if kind == "ur" else Magician(place)
     arm = SafeArm(device, SafetyLimits(box_mm=((-2000, 2000),) * 3))
     source = MjpegCamera(url, load_sensor("mg400-331"), Form.RAW)
 
@@ -193,19 +219,19 @@ def measure(seed: int, case: tuple[str, str, str] | None = None, kind: str = "mg
     start = placed.start_pose(-CLEAR_MM - 10.0)
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        emulator = stack.enter_context(MagicianEmulator() if kind == "magician" else Mg400Emulator(port_offset=None))
-        kinematics = emulator.arm.kinematics
-        emulator.arm.track.__init__(kinematics, kinematics.inverse(kinematics.nearest_pose(start)))
-        camera = stack.enter_context(CameraEmulator(DomeCamera()))
-        place = emulator.device if kind == "magician" else tuple(emulator.ports[port] for port in (29999, 30003, 30004, 30005))
         stops: list[float] = []
-        stop = emulator.arm.track.stop
-
-        def stopped(time_s: float) -> None:
-            stops.append(time.monotonic())
-            stop(time_s)
-
-        emulator.arm.track.stop = stopped
+        if kind.startswith("ros2"):
+            place = f"t{os.getpid()}/run{seed}"
+            emulator = stack.enter_context(Ros2Emulator(kind[5:], namespace=place, pose=start))
+        else:
+            makes = {"magician": MagicianEmulator, "mg400": partial(Mg400Emulator, port_offset=None), "ur": partial(UrEmulator, host=None)}
+            emulator = stack.enter_context(makes[kind]())
+            if kind == "mg400":
+                place = tuple(emulator.ports[port] for port in (29999, 30003, 30004, 30005))
+            else:
+                place = emulator.host if kind == "ur" else emulator.device
+            _start_at(emulator, start, stops)
+        camera = stack.enter_context(CameraEmulator(DomeCamera()))
         done = threading.Event()
         told: list[str] = []
         process = None
@@ -216,7 +242,7 @@ def measure(seed: int, case: tuple[str, str, str] | None = None, kind: str = "mg
             thread = threading.Thread(target=lambda: (process.wait(), done.set()), daemon=True)
         else:
             steps = HEALTHY_STEPS if fault == HEALTHY else STEPS
-            act = program(kind, command, place, camera.url, folder / "data", emulator.pose, steps=steps)
+            act = program(kind, command, place, camera.url, folder / "data", emulator.pose, steps=steps, stops=stops)
 
             def go() -> None:
                 try:
@@ -236,18 +262,35 @@ def measure(seed: int, case: tuple[str, str, str] | None = None, kind: str = "mg
         elif fault != HEALTHY:
             kinds = (CAMERA_FAULTS | KINDS[kind][1])[fault]
             device = camera if fault in CAMERA_FAULTS else emulator
-            device.faults.add(kinds[rng.randrange(len(kinds))])
+            device.faults.add(kinds[rng.randrange(len(kinds))]) if kinds else emulator.unplug()
         fault_s = time.monotonic()
         done.wait(30.0)
         time.sleep(1.2 if process is not None else 0.1)
-        ended = done.is_set()
-        emulator.arm.track.stop = stop
-        found = _judged(emulator, placed, fault_s, stops)
-        safe = ended and not emulator.arm.busy() and (kind == "magician" or not emulator.arm.enabled)  # which has no such state
+        ended, told_s = done.is_set(), time.monotonic()
+        found = _judged(emulator, placed, fault_s, [at_s for at_s in stops if at_s < told_s])
+        if isinstance(emulator, Ros2Emulator):  # no more commands come
+            commands, pose = emulator.commands, emulator.pose()
+            time.sleep(0.2)
+            safe = ended and emulator.commands == commands and np.array_equal(emulator.pose(), pose)
+        else:
+            safe = ended and not emulator.arm.busy() and (kind == "magician" or not emulator.arm.enabled)  # which has no such state
         if fault in (*CAMERA_FAULTS, HEALTHY):  # without feedback, an arm is not moved back
             safe = safe and -placed.touch(emulator.pose()).indent_mm > 5.0
         thread.join(5.0)
         return Run(command, phase, fault, seed, *found, safe, "; ".join(told))
+
+
+def _start_at(emulator, start: np.ndarray, stops: list[float]) -> None:
+    """Put an emulated arm at a pose, and note when it is stopped."""
+    kinematics, track = emulator.arm.kinematics, emulator.arm.track
+    track.__init__(kinematics, kinematics.inverse(kinematics.nearest_pose(start)))
+    stop = track.stop
+
+    def stopped(time_s: float) -> None:
+        stops.append(time.monotonic())
+        stop(time_s)
+
+    track.stop = stopped
 
 
 def _await_phase(emulator, placed, phase: str, gap_mm: float, later_s: float, done: threading.Event) -> None:
@@ -257,7 +300,10 @@ def _await_phase(emulator, placed, phase: str, gap_mm: float, later_s: float, do
         now_s, pose = time.monotonic(), emulator.pose()
         gap = -placed.touch(pose).indent_mm
         clear = clear or gap < CLEAR_MM - 1.0
-        ready = emulator.arm.takes_moves if isinstance(emulator, MagicianEmulator) else emulator.arm.enabled
+        if isinstance(emulator, Ros2Emulator):
+            ready = emulator.commands > 0
+        else:
+            ready = emulator.arm.takes_moves if isinstance(emulator, MagicianEmulator) else emulator.arm.enabled
         if phase == "standing" and ready:
             return
         if phase in GAPS_MM and clear and gap <= gap_mm:
@@ -272,7 +318,7 @@ def _await_phase(emulator, placed, phase: str, gap_mm: float, later_s: float, do
 def _judged(emulator, placed, fault_s: float, stops: list[float]) -> tuple[float, float, float, float]:
     """Time until the stop, time until the arm stood, travel towards the object, and the part of it in contact."""
     times = np.arange(fault_s, time.monotonic(), STEP_S)
-    poses = np.array([emulator.arm.track.pose(time_s) for time_s in times])
+    poses = np.array([emulator.pose(time_s) for time_s in times])
     depths = np.array([placed.touch(pose).indent_mm for pose in poses])
     moves = np.r_[np.abs(np.diff(poses, axis=0)).max(axis=1) > 1e-6, False]
     segments: list[list[int]] = []  # first and last sample of each motion
@@ -299,7 +345,7 @@ def _judged(emulator, placed, fault_s: float, stops: list[float]) -> tuple[float
 def table(runs: list[Run]) -> str:
     """The worst of each fault and phase, in Markdown."""
     lines = ["| fault | phase | runs | detected, s | stands, s | towards, mm | pressed, mm | wrong |", "| --- " * 8 + "|"]
-    for fault in FAULTS:
+    for fault in dict.fromkeys((*FAULTS, *(run.fault for run in runs))):
         for phase in PHASES:
             some = [run for run in runs if (run.fault, run.phase) == (fault, phase)]
             if some:

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from threading import Timer
 from types import SimpleNamespace
 
@@ -10,10 +11,13 @@ import numpy as np
 from arms import mg400_of
 
 from hardware.arms.magician import Magician
+from hardware.arms.ur.driver import UR
 from hardware.emulators.magician import FAULTS as MAGICIAN_FAULTS
 from hardware.emulators.magician import MagicianEmulator
 from hardware.emulators.mg400 import FAULTS as MG400_FAULTS
 from hardware.emulators.mg400 import Mg400Emulator
+from hardware.emulators.ur import FAULTS as UR_FAULTS
+from hardware.emulators.ur import UrEmulator
 from hardware.errors import DeviceError
 
 PHASES = ("before", "during", "waiting", "stopping")
@@ -23,7 +27,8 @@ VALUES = dict.fromkeys(("silent-feedback", "frozen", "die", "unplugged", "emerge
     "short-packets": 2,
     "wrong-test-value": 2,
 }
-DEVICES = {"mg400": MG400_FAULTS, "magician": MAGICIAN_FAULTS}
+DEVICES = {"mg400": MG400_FAULTS, "magician": MAGICIAN_FAULTS, "ur": UR_FAULTS}
+STARTS = {"mg400": [300.0, 0, 0, 0, 0, 0], "magician": [200.0, 0, 30, 0, 0, 0], "ur": [100.0, -500, 200, 0, 0, -160]}
 CASES = [(device, fault, phase) for device, faults in DEVICES.items() for fault in faults for phase in PHASES]
 SPEED_MM_S, WAY_MM, LIMIT_S = 80.0, 60.0, 1.5
 FAULT_AFTER_S = 0.2  # of a move of 0.75 s
@@ -73,7 +78,8 @@ def measure(device: str, fault: str, phase: str) -> Told:
     known = DEVICES[device][fault]
     text = fault if known.allowed is None else f"{fault}={VALUES.get(fault, known.default)}"
     first = (text,) if phase == "before" and fault not in ("die", "unplugged") else ()
-    emulator = Mg400Emulator(port_offset=None, faults=first) if device == "mg400" else MagicianEmulator(faults=first)
+    makes = {"mg400": partial(Mg400Emulator, port_offset=None), "magician": MagicianEmulator, "ur": partial(UrEmulator, host=None)}
+    emulator = makes[device](faults=first)
     calls = SimpleNamespace(fault_s=0.0, longest_s=0.0, told="", ended_s=0.0)
 
     def fail() -> None:
@@ -98,8 +104,8 @@ def measure(device: str, fault: str, phase: str) -> Told:
         calls.longest_s = max(calls.longest_s, calls.ended_s - begun_s)
 
     with emulator:
-        arm = mg400_of(emulator) if device == "mg400" else Magician(emulator.device)
-        start = np.array([300.0, 0, 0, 0, 0, 0]) if device == "mg400" else np.array([200.0, 0, 30, 0, 0, 0])
+        drives = {"mg400": mg400_of, "magician": lambda emulator: Magician(emulator.device), "ur": lambda emulator: UR(emulator.host)}
+        arm, start = drives[device](emulator), np.array(STARTS[device])
         target = start + [0, WAY_MM, 0, 0, 0, 0]
         calls.fault_s = time.monotonic()
         call(arm.connect)

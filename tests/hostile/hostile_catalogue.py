@@ -367,7 +367,7 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--stream --rate": "nan inf",
         "--model": "nowhere",
         "--camera": "nowhere http://127.0.0.1:1",
-        "--arm": "nowhere mg400:127.0.0.1:1 mg400:999.1.1.1 magician:nowhere simulated:nowhere",
+        "--arm": "nowhere mg400:127.0.0.1:1 mg400:999.1.1.1 magician:nowhere simulated:nowhere ros2:nowhere",
         "--safety": "nowhere",
         "--servo": "nowhere",
         "--at-rest": "nowhere.png",
@@ -395,6 +395,8 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--time-scale": "0 -1 nan inf",
     },
     "emulate magician": {"--link": "{frames}/f_0.png /proc/nowhere", "--fault": "nonsense", "--time-scale": "0 -1 nan inf"},
+    "emulate ros2": {"--form": "nonsense", "--namespace": "1a a//b", "--fault": "nonsense"},
+    "emulate ur": {"--host": "999.1.1.1 nowhere.invalid", "--fault": "nonsense", "--time-scale": "0 -1 nan inf"},
     f"emulate camera {S} --object plane": {
         "--arm": "nowhere mg400:127.0.0.1:1",
         "--arm mg400:127.0.0.1:1 --fps": "0 nan",
@@ -461,7 +463,8 @@ def _numbers() -> list[Entry]:
 
 EVERY = (
     *("audit", "calibrate contact", "calibrate optics", "check", "collect", "convert", "dataset", "demo", "doctor", "emulate camera"),
-    *("emulate magician", "emulate mg400", "evaluate", "experiments", "graph", "live", "new", "objects", "pack", "predict", "preprocess"),
+    *("emulate magician", "emulate mg400", "emulate ros2", "emulate ur"),
+    *("evaluate", "experiments", "graph", "live", "new", "objects", "pack", "predict", "preprocess"),
     *(
         "randomisations",
         "realism",

@@ -213,6 +213,7 @@ SERVERS = {  # a while of each: whether it listens beyond this machine
     "live": f"live --model {SENSOR} --camera {{frames}} --port 9102 --seconds 4",
     "emulate mg400": "emulate mg400 --port-offset 12000",
     "emulate magician": "emulate magician",
+    "emulate ur": "emulate ur --host 127.0.0.7",
 }
 
 

@@ -57,7 +57,7 @@ TWIN_LAYERS = (  # of twin's packages and modules, the innermost first: each may
     "extend",
     "__main__",
 )
-EXTRAS = ("cluster", "models", "mujoco", "records", "rl", "ros2", "studio")  # what the extra `all` brings
+EXTRAS = ("cluster", "models", "mujoco", "records", "rl", "ros2", "studio", "ur")  # what the extra `all` brings
 BY_HAND = {"pyoidn"}  # installed by hand for the one measurement that needs it, as its head says
 NAMED_OTHERWISE = {"rerun": "rerun-sdk"}  # imported under another name than it is installed by, and not installed everywhere
 # The outermost layer may join everything, and nothing joins it: the command line (test_command_line), and the names that Python offers.

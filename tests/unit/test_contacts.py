@@ -9,24 +9,16 @@ import numpy as np
 import pytest
 from drawn_frames import drawn_frame
 from drawn_recording import config_of
+from weights.contacts import KindOfContact, fit_contacts, intervals_on, put_together, write_contacts
 
 from training.data.dataset import join_datasets
 from training.data.label_code import label_error
 from training.data.targets import Targets
 from training.errors import TrainingError
-from training.estimate.contact_estimator import (
-    CONTACTS,
-    ContactEstimator,
-    KindOfContact,
-    contacts_folder,
-    fit_contacts,
-    put_together,
-    read_contacts,
-    write_contacts,
-)
+from training.estimate.contact_estimator import CONTACTS, ContactEstimator, contacts_folder, read_contacts
 from training.estimate.estimator import PoseEstimator
 from training.runs.run import train_run
-from training.studies.judging import intervals_on, measure_errors
+from training.studies.judging import measure_errors
 from training.studies.sim_to_real.steps import widen_intervals
 from training.studies.train import add_domain
 from twin.camera.capture import record

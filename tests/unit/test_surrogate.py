@@ -194,8 +194,8 @@ def test_a_contact_that_is_lost_keeps_the_last_state_and_the_next_begins_at_rest
     assert np.abs(true.felt.force_n).max() > 0.1
     true.begin(0, contact)
     for backend in (made, true):
-        assert np.array_equal(backend.felt.caps_mm[0], made.caps_at_rest_mm) and not backend.felt.force_n.any()
-        assert np.array_equal(backend.attitude(0).caps_mm, made.caps_at_rest_mm) and backend.felt.lost == [""]
+        assert np.array_equal(backend.felt.caps_mm[0], made._caps_rest) and not backend.felt.force_n.any()
+        assert np.array_equal(backend.attitude(0).caps_mm, made._caps_rest) and backend.felt.lost == [""]
 
 
 @pytest.mark.parametrize("gone_mm", [0.1, 8.0])

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from contacts import intervals_on
 from domains import LEARNT, REAL, simulate
 
 from scenes import load_experiment, load_object, load_sensor
@@ -28,7 +29,7 @@ from training.runs.config import RunConfig
 from training.runs.loop import predict_rows
 from training.runs.run import train_run
 from training.runs.run_files import CONFIG, DISPLACEMENTS, SHIPPED, TENSORS, pack, read_config, read_tensors, write_tensors
-from training.studies.judging import intervals_on, measure_errors
+from training.studies.judging import measure_errors
 from training.studies.sim_to_real.discrepancy import Discrepancy, measure_residuals
 from training.studies.sim_to_real.steps import arm_labels, choose_frames, measured_of, widen_intervals, with_missing
 from twin.calibration.contact.simulate import CalibrationSetup

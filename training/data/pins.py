@@ -119,13 +119,8 @@ def pin_table(recording: Recording, spec: SensorSpec, *, problems: list[str], pr
             if progress:
                 progress(frame.sequence + 1, len(recording))
         notes += [f"{bad['image_name']}: {bad['reason']}" for bad in recording.failed]
-        arrays = {
-            "nodes_px": np.reshape(nodes, (-1, n, 2)),
-            "area_px2": np.reshape(areas, (-1, n)),
-            "lost": np.reshape(lost, (-1, n)).astype(bool),
-            "valid": np.array(valid, bool),
-            "light": np.reshape(light, (-1, n)),
-        }
+        arrays = {"nodes_px": np.reshape(nodes, (-1, n, 2)), "area_px2": np.reshape(areas, (-1, n)), "light": np.reshape(light, (-1, n))}
+        arrays |= {"lost": np.reshape(lost, (-1, n)).astype(bool), "valid": np.array(valid, bool)}
         about = {"rest_px": reference.pins_px, "measured": np.array(named != UNMEASURED), "notes": np.array(notes, str)}
         return {"image_name": np.array(names, str)} | about | arrays
 
@@ -150,15 +145,10 @@ def recording_key(recording: Recording, spec: SensorSpec) -> dict[str, object]:
     specification, the layout, the view, and how frames are made and read. A new fit of the rig changes none of these."""
     root = recording.path if recording.path.is_dir() else recording.path.parent
     states = sorted((str(file.relative_to(root)), *_state(file)) for file in root.rglob("*") if file.is_file())
-    return {
-        "path": str(recording.path.resolve()),
-        "names": recording.names,
-        "files": json.dumps(states),
-        "reference": b"" if recording.reference is None else recording.reference.image.tobytes(),
-        "form": str(recording.form),
-        "sensor": [spec.name]
-        + [part.model_dump(mode="json") for part in (spec.geometry, spec.view, spec.pipeline, spec.recording) if part],
-    }
+    parts = [part.model_dump(mode="json") for part in (spec.geometry, spec.view, spec.pipeline, spec.recording) if part]
+    reference = b"" if recording.reference is None else recording.reference.image.tobytes()
+    files: dict[str, object] = {"path": str(recording.path.resolve()), "names": recording.names, "files": json.dumps(states)}
+    return files | {"reference": reference, "form": str(recording.form), "sensor": [spec.name, *parts]}
 
 
 def _state(file: Path) -> tuple[int, int, int]:

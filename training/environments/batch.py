@@ -397,15 +397,9 @@ class Batch:
         why = np.full(self.count, None, object)
         for row in np.flatnonzero(lost & active):
             why[row] = self.backend.felt.lost[row]
-        info: dict[str, Any] = {
-            "indent_mm": seen.touch.indent_mm,
-            "angle_deg": seen.touch.angle_deg,
-            "force_n": np.linalg.norm(seen.reading.force_n, axis=1),
-            "slip": seen.reading.slip.copy(),
-            "is_success": success,
-            "outside": why,
-            **judged.terms,
-        }
+        force_n = np.linalg.norm(seen.reading.force_n, axis=1)
+        info: dict[str, Any] = {"indent_mm": seen.touch.indent_mm, "angle_deg": seen.touch.angle_deg, "force_n": force_n}
+        info |= {"slip": seen.reading.slip.copy(), "is_success": success, "outside": why, **judged.terms}
         return Stepped(reward, failed | reached, ended & ~(failed | reached), info)
 
     def _move(self, rows: IntArray) -> None:

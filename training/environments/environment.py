@@ -89,9 +89,8 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         if self._state == "new":
             raise OptionError("step() before reset(); call reset() first")
         done = self.batch.step(self.batch.as_numbers(action, (len(self.batch.axes),))[None], np.zeros(1, int))
-        info = {
-            name: value.item() if isinstance(value, np.generic) else value for name, value in _row(done.info).items() if value is not None
-        }
+        known = {key: value for key, value in _row(done.info).items() if value is not None}
+        info = {key: value.item() if isinstance(value, np.generic) else value for key, value in known.items()}
         self._show(float(done.reward[0]))
         return _row(self.batch.observation()), float(done.reward[0]), bool(done.terminated[0]), bool(done.truncated[0]), info
 
@@ -135,26 +134,11 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
             print(f"open {self._page.url} in a browser: it shows the episode", file=sys.stderr, flush=True)
         T = batch.tool.object_poses(batch.T_work, batch.T_object)[0]
         place_mm, felt = batch.touch().place_mm[0], batch.backend.felt
-        shown = {
-            "goal": ", ".join(
-                _in_units(name, value) for name, value in zip(batch.task.goal_names, batch.goals_for_agents()[0].tolist(), strict=True)
-            ),
-            "contact area, slipping": f"{felt.area_mm2[0]:.0f} mm2, {100 * felt.slip[0]:.0f} %",
-            "not computed": felt.lost[0],
-        }
-        self._page.show(
-            EpisodeStep(
-                int(batch.steps_done[0]),
-                frame,
-                batch.backend.attitude(0),
-                contact.obj,
-                T,
-                felt.force_n[0].copy(),
-                T[:3, :3] @ place_mm + T[:3, 3],
-                reward,
-                {name: text for name, text in shown.items() if text},
-            )
-        )
+        goal = ", ".join(map(_in_units, batch.task.goal_names, batch.goals_for_agents()[0].tolist()))
+        area = f"{felt.area_mm2[0]:.0f} mm2, {100 * felt.slip[0]:.0f} %"
+        shown = {"goal": goal, "contact area, slipping": area, "not computed": felt.lost[0]}
+        seen = int(batch.steps_done[0]), frame, batch.backend.attitude(0), contact.obj, T, felt.force_n[0].copy()
+        self._page.show(EpisodeStep(*seen, T[:3, :3] @ place_mm + T[:3, 3], reward, {name: text for name, text in shown.items() if text}))
         time.sleep(max(0.0, self._shown_s + 1 / RENDER_FPS - time.monotonic()))
         self._shown_s = time.monotonic()
 

@@ -45,8 +45,10 @@ LEAST_DEVIATION = 1e-3
 LEAST_SPREAD, ROUGH_SPREAD = 0.01, 0.02
 """Least scale of a component, with and without the state estimator, as a share of the largest component's spread. Smaller components are
 noise."""
-LAYERS = (64, 64)
-"""Neurons of the policy's hidden layers, with tanh."""
+NETWORK = {"net_arch": [64, 64], "log_std_init": -0.7}
+"""Neurons of the policy's hidden layers, with tanh, and logarithm of the first standard deviation of its actions."""
+PPO_SETTINGS: dict[str, Any] = {"n_epochs": 8, "learning_rate": 7e-4, "gamma": 0.95, "gae_lambda": 0.9, "ent_coef": 0.0}
+"""Settings of proximal policy optimisation."""
 ROLLOUT = 32
 """Steps of each environment between two updates."""
 WINDOW = 100
@@ -171,20 +173,8 @@ def learn_policy(plan: LearnPlan, out: Path, *, progress: Progress = silent) -> 
     blank = _untrained_inputs(plan, vector)
     env = SteppedTogether(vector, blank)
     env.seed(plan.seed)
-    ppo = PPO(
-        "MlpPolicy",
-        env,
-        n_steps=ROLLOUT,
-        batch_size=max(plan.environments * ROLLOUT // 4, 2),
-        n_epochs=8,
-        learning_rate=7e-4,
-        gamma=0.95,
-        gae_lambda=0.9,
-        ent_coef=0.0,
-        policy_kwargs={"net_arch": list(LAYERS), "log_std_init": -0.7},
-        seed=plan.seed,
-        device="cpu",
-    )
+    batch = max(plan.environments * ROLLOUT // 4, 2)
+    ppo = PPO("MlpPolicy", env, n_steps=ROLLOUT, batch_size=batch, policy_kwargs=NETWORK, seed=plan.seed, device="cpu", **PPO_SETTINGS)
     with stage(progress, f"learning {plan.task}") as step:
         watch = _Watch(plan, step, begun_s)
         ppo.learn(10**9, callback=watch)
@@ -269,19 +259,10 @@ def _untrained_inputs(plan: LearnPlan, vector: TactileVectorEnv) -> Policy:
     count, least = (COMPONENTS, LEAST_SPREAD) if plan.sight else (ROUGH_COMPONENTS, ROUGH_SPREAD)
     largest = np.argsort(variance)[::-1][:count]
     spread = np.sqrt(np.maximum(variance[largest], least**2 * variance.max()))
-    about = {
-        "task": plan.task,
-        "experiment": task.experiment,
-        "sensor": batch.sensor.model_dump(mode="json"),
-        "observation": plan.options.observation,
-        "stack": plan.options.stack,
-        "axes": list(batch.axes),
-        "scale": batch.action_scale.tolist(),
-        "feed_mm": list(task.feed_mm),
-        "goal_names": list(task.goal_names),
-        "goal": np.median(goal, axis=0).tolist(),
-        "trained": {**asdict(plan.options), "seed": plan.seed},
-    }
+    about: dict[str, Any] = {"task": plan.task, "experiment": task.experiment, "sensor": batch.sensor.model_dump(mode="json")}
+    about |= {"observation": plan.options.observation, "stack": plan.options.stack, "axes": list(batch.axes)}
+    about |= {"scale": batch.action_scale.tolist(), "feed_mm": list(task.feed_mm), "goal_names": list(task.goal_names)}
+    about |= {"goal": np.median(goal, axis=0).tolist(), "trained": {**asdict(plan.options), "seed": plan.seed}}
     blank = Policy(about, mean, basis[:, largest].T / spread[:, None], ())
     if plan.options.observation == "oracle" or not plan.sight:
         return blank

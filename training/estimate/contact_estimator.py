@@ -17,8 +17,6 @@ from pathlib import Path
 from time import perf_counter
 
 import numpy as np
-import torch
-from torch import nn
 
 from scenes.sensor import SensorSpec
 from training.data.dataset import Dataset
@@ -26,23 +24,15 @@ from training.data.pins import PinTable
 from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimate, PoseEstimator
 from training.models.part import Prediction, Unseen
-from training.runs.run_files import AGAIN, damage_error, folder_of, pack
+from training.runs.run_files import AGAIN, damage_error, folder_of
 from twin.camera.capture import in_form
 from twin.frames import Recording
 from twin.frames.tables import numbers
-from twin.store import ArrayFile, Layers, layers_from, layers_to, through_layers, write_json, writes
+from twin.store import ArrayFile, Layers, layers_from, through_layers
 from twin.types import Frame
 
 CONTACTS = "contacts.safetensors"
-FILE = ArrayFile(
-    "file of kinds of contact", "training.estimate.contact_estimator.put_together", version=1, error=TrainingError, again=AGAIN
-)
-# Number of modes of the displacements of all kinds together, which the network uses.
-COMMON_MODES = 60
-# Training of the network: units, epochs, batch, learning rate, weight decay.
-UNITS, EPOCHS, BATCH, RATE, DECAY = 64, 30, 128, 3e-3, 1e-3
-# Least standard deviation of a mode relative to the largest one. Smaller modes are rounding errors.
-LEAST_DEVIATION = 1e-6
+FILE = ArrayFile("file of kinds of contact", "tests/weights/contacts.py", version=1, error=TrainingError, again=AGAIN)
 # Folder, inside that of a sensor's weights, with the models of several kinds of contact.
 INSIDE = "contacts"
 # File with the model and the intervals of each kind.
@@ -62,16 +52,6 @@ class DisplacementModes:
     def __call__(self, moved: np.ndarray) -> np.ndarray:
         """(M, K) amplitudes."""
         return (moved.reshape(len(moved), -1) - self.mean) @ self.components
-
-    @classmethod
-    def fit_modes(cls, moved: np.ndarray, most: int) -> "DisplacementModes":
-        """The first modes of displacements, at most ``most``."""
-        flat = moved.reshape(len(moved), -1)
-        mean = flat.mean(axis=0)
-        square, direction = np.linalg.eigh((flat - mean).T @ (flat - mean) / len(flat))
-        deviation = np.sqrt(np.maximum(square[::-1][:most], 0))
-        keep = deviation > LEAST_DEVIATION * deviation[0]
-        return cls(mean, direction[:, ::-1][:, :most][:, keep] / deviation[keep])
 
 
 @dataclass(frozen=True)
@@ -102,53 +82,6 @@ class Contacts:
 def moved_of(pins: PinTable) -> np.ndarray:
     """(M, N, 2) displacements from rest, in mean rest spacings."""
     return (pins.nodes_px - pins.reference.pins_px) / pins.reference.spacing_px.mean()
-
-
-def fit_contacts(frames: Mapping[str, Sequence[Dataset]], *, seed: int) -> Contacts:
-    """Learn to classify kinds of contact, each given by one or more data sets of one sensor.
-
-    Raises
-    ------
-    TrainingError
-        There are fewer than two kinds.
-    """
-    if len(frames) < 2:
-        raise TrainingError("to distinguish kinds of contact, frames of at least two are needed")
-    moved = {name: np.concatenate([moved_of(each.pins) for each in frames[name]]) for name in sorted(frames)}
-    together = np.concatenate(list(moved.values()))
-    modes = DisplacementModes.fit_modes(together, COMMON_MODES)
-    right = np.repeat(np.arange(len(moved)), [len(each) for each in moved.values()])
-    return Contacts(tuple(moved), modes, _layers(modes(together), right, seed))
-
-
-def _layers(seen: np.ndarray, right: np.ndarray, seed: int) -> Layers:
-    """Layers of a network trained to classify the kind (M,), given as numbers, from modes (M, K)."""
-    generator = torch.Generator().manual_seed(seed)
-    sizes = [seen.shape[1], UNITS, UNITS, int(right.max()) + 1]
-    layers = [nn.Linear(a, b) for a, b in zip(sizes, sizes[1:], strict=False)]
-    for layer in layers:
-        nn.init.normal_(layer.weight, std=(2 / layer.in_features) ** 0.5, generator=generator)
-        nn.init.zeros_(layer.bias)
-    network = nn.Sequential(layers[0], nn.ReLU(), layers[1], nn.ReLU(), layers[2])
-    x, y = torch.from_numpy(seen.astype(np.float32)), torch.from_numpy(right)
-    optimiser = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=DECAY)
-    steps = EPOCHS * -(-len(x) // BATCH)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
-    for _ in range(EPOCHS):
-        for chosen in torch.randperm(len(x), generator=generator).split(BATCH):
-            loss = nn.functional.cross_entropy(network(x[chosen]), y[chosen])
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-            schedule.step()
-    return tuple((layer.weight.detach().numpy(), layer.bias.detach().numpy()) for layer in layers)
-
-
-def write_contacts(path: Path, contacts: Contacts) -> None:
-    """Write contacts in the form that ``read_contacts`` reads: components in half precision."""
-    arrays = {"modes.mean": contacts.modes.mean, "modes.components": contacts.modes.components, **layers_to(contacts.layers)}
-    half = {key: array.astype(np.float16 if key == "modes.components" else np.float32) for key, array in arrays.items()}
-    FILE.write(path, half, {"kinds": list(contacts.kinds)})
 
 
 def read_contacts(path: Path) -> Contacts:
@@ -195,7 +128,7 @@ class ContactEstimator:
 
     @classmethod
     def load(cls, folder: Path) -> "ContactEstimator":
-        """Load a folder that ``put_together`` wrote.
+        """Load a folder that ``put_together`` (tests/weights/contacts.py) wrote.
 
         Raises
         ------
@@ -313,49 +246,3 @@ def contacts_folder(run: str | Path) -> Path | None:
     """The folder with the models of several kinds, for a run's folder or a sensor's name; None if it has none."""
     folder = folder_of(run)
     return next((place for place in (folder, folder / INSIDE) if (place / CONTACTS).is_file()), None)
-
-
-@dataclass(frozen=True)
-class KindOfContact:
-    """A kind of contact, as input of ``put_together``.
-
-    Attributes
-    ----------
-    model : str
-        Name of the run that estimates it.
-    frames : sequence of Dataset
-        Frames of this kind, on which the classifier is trained. Give the training frames of the run.
-    intervals : dict of str to array
-        The run's interval quantiles for this kind, from frames that it did not learn from (``training.studies.judging.intervals_on``). If
-        empty, the run's own intervals are used.
-    """
-
-    model: str
-    frames: Sequence[Dataset]
-    intervals: Mapping[str, np.ndarray] = field(default_factory=dict)
-
-
-@writes(CONTACTS, KINDS)
-def put_together(runs: Mapping[str, Path], kinds: Mapping[str, KindOfContact], out: Path, *, seed: int = 0) -> ContactEstimator:
-    """Make one estimator of several kinds of contact, and write it to a folder.
-
-    Parameters
-    ----------
-    runs : dict of str to Path
-        Finished runs by name; each must have a small copy (``training.runs.run_files.pack``).
-    kinds : dict of str to KindOfContact
-
-    Raises
-    ------
-    TrainingError
-        A run has no small copy, or there are too few frames or kinds.
-    """
-    contacts = fit_contacts({name: kind.frames for name, kind in kinds.items()}, seed=seed)
-    for name, run in runs.items():
-        pack(run, out / name)
-    write_contacts(out / CONTACTS, contacts)
-    said: dict[str, dict[str, object]] = {}
-    for name, kind in kinds.items():
-        said[name] = {"model": kind.model} | {key: np.asarray(value).tolist() for key, value in kind.intervals.items()}
-    write_json(out / KINDS, said)
-    return ContactEstimator.load(out)

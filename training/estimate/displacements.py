@@ -168,9 +168,7 @@ def other_rest(known: DisplacementModel | None, start: Reference, pins_px: np.nd
     return found if away > SAME_UNIT * float(np.median(start.spacing_px)) else None
 
 
-def _round(
-    known: DisplacementModel, whiten: np.ndarray, seen: np.ndarray, a: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _round(known: DisplacementModel, whiten: np.ndarray, seen: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, ...]:
     """Whitened slopes (M, 2N, D) and distances (M, 2N) at the coordinates (M, D), and each frame's inverse Hessian and gradient."""
     slopes = whiten @ known.slopes(a)
     away = (seen - known.at(a)) @ whiten.T

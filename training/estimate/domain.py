@@ -557,9 +557,8 @@ def _fit_changes(flat: np.ndarray, labelled: np.ndarray, motions: np.ndarray, rn
     dim = np.sort(rng.permutation(np.concatenate([np.flatnonzero(~labelled), np.arange(len(flat), len(every))]))[: KNOWN // 2])
     known = np.concatenate([a[rows, :lead], a[dim, :lead], (-mean @ components.T / deviation)[None, :lead]])
     none = np.zeros(0)
-    return Domain(
-        motions, mean, components, deviation, weight, whiten, usual, known, np.ones(11), none, none, none, none, len(dim) + 1, 0.0, 0.0
-    )
+    given = motions, mean, components, deviation, weight, whiten, usual, known, np.ones(11)
+    return Domain(*given, none, none, none, none, len(dim) + 1, 0.0, 0.0)
 
 
 def _places(reference: Reference) -> FloatArray:
@@ -635,13 +634,9 @@ def domain_of(arrays: Mapping[str, np.ndarray], about: Mapping[str, Any], pins: 
     ValueError
         It belongs to other pins or labels.
     """
-    found = Domain(
-        **{name: array.astype(float) for name, array in arrays.items()},
-        lighter=int(about["lighter"]),
-        near=float(about["near"]),
-        blind=float(about["blind"]),
-        simulated=bool(about.get("simulated", False)),
-    )
+    values: dict[str, Any] = {name: array.astype(float) for name, array in arrays.items()}
+    values |= {"lighter": int(about["lighter"]), "near": float(about["near"]), "blind": float(about["blind"])}
+    found = Domain(**values, simulated=bool(about.get("simulated", False)))
     if found.mean.shape != (2 * pins,) or found.rate.shape != (labels,):
         raise ValueError("of other pins or labels")
     return found

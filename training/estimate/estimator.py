@@ -21,24 +21,8 @@ from training.estimate.rest import RestPlaces, RestSeeker
 from training.estimate.widening import Widening
 from training.models import model_named
 from training.models.part import Inputs, OneFrame, PinModel, Prediction, Trained, Unseen
+from training.runs import run_files
 from training.runs.assemble import Ensemble
-from training.runs.run_files import (
-    CHECKPOINT,
-    CONFIG,
-    DISPLACEMENTS,
-    DOMAIN,
-    MAPS,
-    SLIP,
-    TENSORS,
-    WEIGHTS,
-    damage_error,
-    folder_of,
-    instead_of,
-    read_config,
-    read_tensors,
-    require_together,
-    unpack,
-)
 from training.touch.contact_maps import MapModel, read_maps
 from training.touch.contact_probability import TouchAnswer
 from training.touch.slip import NAMES as SLIP_NAMES
@@ -163,28 +147,29 @@ class PoseEstimator:
         TrainingError
             The folder holds no trained model, or one that this version can't read.
         """
-        run = folder_of(run)
-        packed = (run / WEIGHTS).is_file()
-        if not packed and not (run / TENSORS).is_file():
-            hint = "it was begun and not finished; continue it with 'twin train'" if (run / CHECKPOINT).is_file() else instead_of(run)
+        run = run_files.folder_of(run)
+        packed, begun = (run / run_files.WEIGHTS).is_file(), (run / run_files.CHECKPOINT).is_file()
+        weights = run / (run_files.WEIGHTS if packed else run_files.TENSORS)
+        if not weights.is_file():
+            hint = "it was begun and not finished; continue it with 'twin train'" if begun else run_files.instead_of(run)
             raise TrainingError(f"{run}: holds no trained model: {hint}")
-        config = read_config(run)
+        config = run_files.read_config(run)
         try:
-            content = unpack(config, run / WEIGHTS) if packed else read_tensors(run / TENSORS)
-            require_together(run, config, content)
+            content = run_files.unpack(config, weights) if packed else run_files.read_tensors(weights)
+            run_files.require_together(run, config, content)
             if "correction" in content:
                 raise TrainingError(f"{run}: corrected by a regression, which this version does not know; train again")
             found = cls(config, content)
         except (OSError, ValueError, KeyError, RuntimeError, TypeError, AttributeError, IndexError) as error:
-            raise damage_error(run / (WEIGHTS if packed else TENSORS), f"its weights do not fit {CONFIG}") from error
-        if (run / MAPS).is_file():
-            found.maps = read_maps(run / MAPS, found.sensor.geometry)
-        if (run / SLIP).is_file():
-            found.slip = read_slip(run / SLIP)
-        if (run / DISPLACEMENTS).is_file():
-            found.displacements = read_displacements(run / DISPLACEMENTS, found.sensor.pins.count)
-        if (run / DOMAIN).is_file():
-            found.domain = read_domain(run / DOMAIN, found.sensor.pins.count, len(found.names))
+            raise run_files.damage_error(weights, f"its weights do not fit {run_files.CONFIG}") from error
+        if (run / run_files.MAPS).is_file():
+            found.maps = read_maps(run / run_files.MAPS, found.sensor.geometry)
+        if (run / run_files.SLIP).is_file():
+            found.slip = read_slip(run / run_files.SLIP)
+        if (run / run_files.DISPLACEMENTS).is_file():
+            found.displacements = read_displacements(run / run_files.DISPLACEMENTS, found.sensor.pins.count)
+        if (run / run_files.DOMAIN).is_file():
+            found.domain = read_domain(run / run_files.DOMAIN, found.sensor.pins.count, len(found.names))
         return found
 
     @property
@@ -292,8 +277,7 @@ class PoseEstimator:
         return RestSeeker(self) if self.counts_from_rest else self
 
     def with_intervals(self, intervals: Mapping[str, np.ndarray]) -> "PoseEstimator":
-        """The same model with other interval quantiles, as ``training.studies.judging.intervals_on`` finds them for one kind of its
-        frames."""
+        """The same model with other interval quantiles: those of one kind of its frames."""
         found = copy(self)
         found.ensemble = copy(self.ensemble)
         for name, values in intervals.items():
@@ -416,6 +400,7 @@ class PoseEstimator:
         lost: float = 0.0,
         verdict: DomainVerdict = USUAL_FRAME,
     ) -> PoseEstimate:
+        labels = self.names, self.units
         excess: np.ndarray = np.zeros(len(self._bounds[0]))
         if isinstance(made, Prediction) and self.domain is not None:
             reason = verdict.reason
@@ -426,17 +411,13 @@ class PoseEstimator:
             if self._tracker is not None:
                 self._tracker.forget()
             none = np.full(len(self.names), np.nan)
-            return PoseEstimate(
-                self.names, self.units, none, none, none, np.nan, False, made.reason, _ms(started), contact, made.touched, seen=made.seen
-            )
+            return PoseEstimate(*labels, none, none, none, np.nan, False, made.reason, _ms(started), contact, made.touched, seen=made.seen)
         value, half, executed = made.mean[0], made.half_width[0], float(made.executed[0])
         low, high, notes = self._widening(value, half, lost, verdict, excess)
         value, low, high = (np.clip(each, *self._bounds) for each in (value, low, high))
         if slip is not None:
             value, low, high = (np.concatenate(pair) for pair in zip((value, low, high), slip.values, strict=True))
-        return PoseEstimate(
-            self.names, self.units, value, low, high, executed, True, "", _ms(started), contact, made.touched, notes, made.seen
-        )
+        return PoseEstimate(*labels, value, low, high, executed, True, "", _ms(started), contact, made.touched, notes, made.seen)
 
     def pins_in(self, frame: Frame) -> OneFrame | Unseen:
         """The pins of one frame, or the reason why they can't be used; raises as a call does."""

@@ -7,7 +7,7 @@ For a camera whose sensor was never shown without contact, ``RestSeeker`` collec
 import logging
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from twin.frames import spread_indices
 from twin.pins import PinView, Pipeline, Reference, make_reference, measure_reference, view_of
 from twin.pins.labelling.view import camera_modes
 from twin.types import Form, Frame, Observation
+
+if TYPE_CHECKING:
+    from training.estimate.estimator import PoseEstimator
 
 FEWEST_VIEWED = 8
 """Least number of contacts whose median pins show the camera's view."""
@@ -145,16 +148,6 @@ class RestPlaces:
         return view
 
 
-class RestingModel(SensorModel, Protocol):
-    """A model whose pins at rest can be estimated from contacts (``training.estimate.estimator.PoseEstimator``)."""
-
-    def at_known_rest(self) -> "RestingModel": ...
-
-    def rest_from_contacts(self, nodes_px: np.ndarray, name: str) -> tuple["RestingModel", bool]: ...
-
-    def estimate_without_pose(self, seen: Unseen, started: float) -> Estimate: ...
-
-
 class RestSeeker:
     """A model on a stream of frames. It starts with the known rest places, and changes to those estimated from the contacts as soon as
     possible.
@@ -165,7 +158,7 @@ class RestSeeker:
 
     Parameters
     ----------
-    model : RestingModel
+    model : PoseEstimator
 
     Attributes
     ----------
@@ -180,7 +173,7 @@ class RestSeeker:
     pipeline: Pipeline
     counts_from_rest = True
 
-    def __init__(self, model: RestingModel) -> None:
+    def __init__(self, model: "PoseEstimator") -> None:
         self._given, self._model, self.other = model, model.at_known_rest(), False
         self.sensor, self.form, self.pipeline = model.sensor, model.form, self._model.pipeline
         self._contacts_px: list[np.ndarray] = []

@@ -21,19 +21,10 @@ from scenes.experiment import LABELS
 from scenes.files import read_regular
 from training.generation.config import DatasetError, GenerationConfig
 from training.generation.make import REST, Outcome, make_contact
+from twin import store
 from twin.errors import ErrorsAs, StoreError
 from twin.frames.truth import TRUTH, image_name
-from twin.store import (
-    contents,
-    remove_parts,
-    replace_folder,
-    require_same_code,
-    unwritten,
-    write_bytes,
-    write_npz,
-    write_text,
-    written_by_us,
-)
+from twin.store import write_text
 
 # Largest size of a JSON file of a data set, bytes. A sensor's measured tables are its largest part.
 LARGEST_RECORD = 100_000_000
@@ -96,7 +87,7 @@ class Store:
         self._check_config()
         try:
             for place in (folder, folder / RECORDS, self.pictures):
-                remove_parts(place)
+                store.remove_parts(place)
             (folder / RECORDS).mkdir(exist_ok=True)
             if config.images != "none":
                 self.pictures.mkdir(exist_ok=True)
@@ -131,12 +122,12 @@ class Store:
 
     def _keep(self, outcome: Outcome) -> None:
         if outcome.index == REST:
-            write_bytes(self.folder / "init_0.png", outcome.images[0])
+            store.write_bytes(self.folder / "init_0.png", outcome.images[0])
             return
         for state, image in enumerate(outcome.images):
-            write_bytes(self.pictures / image_name(outcome.index, state), image)
+            store.write_bytes(self.pictures / image_name(outcome.index, state), image)
         notes = json.dumps({"draw": outcome.draw, "failures": outcome.failures})
-        write_npz(self.folder / RECORDS / f"{outcome.index:06d}.npz", {"notes": np.array(notes), **outcome.arrays}, compressed=True)
+        store.write_npz(self.folder / RECORDS / f"{outcome.index:06d}.npz", {"notes": np.array(notes), **outcome.arrays}, compressed=True)
 
     def finish(self, count: int) -> int:
         """Write tables and truth of the contacts 0 to ``count`` - 1, and return the number of frames."""
@@ -153,11 +144,11 @@ class Store:
             write_text(self.folder / "meta.json", json.dumps(self._meta(count)))
             for name, rows in tables.items():
                 write_text(self.folder / name, _csv(rows, FAILURE_COLUMNS if name == "failures.csv" else None))
-            replace_folder(truth.path, self.folder / TRUTH)
+            store.replace_folder(truth.path, self.folder / TRUTH)
         except StoreError as error:
             raise self._unfinished_error(error) from error
         except OSError as error:
-            raise self._unfinished_error(unwritten(self.folder / TRUTH, error)) from error
+            raise self._unfinished_error(store.unwritten(self.folder / TRUTH, error)) from error
         return len(tables["targets.csv"])
 
     def _add_rows(self, tables: dict, index: int, arrays: dict, notes: dict) -> None:
@@ -175,16 +166,9 @@ class Store:
         """Content of ``meta.json``, with the keys that recordings have."""
         experiment, recording = self.config.experiment, self.config.sensor.recording
         low, high = np.array(list(experiment.ranges().values())).T.tolist()
-        meta = {
-            "image_dir": self.config.image_folder,
-            "target_df_file": "targets.csv",
-            "tap_move": list(experiment.tap),
-            "poses_rng": [high[:6], low[:6]],
-            "moves_rng": [high[6:], low[6:]],
-            "num_poses": count,
-            "num_frames": 1,
-            "comments": f"simulated: {experiment.name}, {self.config.sensor.name}, {self.config.object.name}",
-        }
+        meta: dict[str, Any] = {"image_dir": self.config.image_folder, "target_df_file": "targets.csv", "tap_move": list(experiment.tap)}
+        meta |= {"poses_rng": [high[:6], low[:6]], "moves_rng": [high[6:], low[6:]], "num_poses": count, "num_frames": 1}
+        meta |= {"comments": f"simulated: {experiment.name}, {self.config.sensor.name}, {self.config.object.name}"}
         if recording and self.config.images == "processed":
             meta["threshold"] = [recording.threshold_block_px, recording.threshold_offset]
             meta["crop"] = list(recording.crop_px)
@@ -198,9 +182,9 @@ class Store:
             if before != now:
                 other = ", ".join(key for key in {**now, **before} if before.get(key) != now.get(key))
                 raise DatasetError(f"{self.folder}: holds a data set with other settings ({other}); repeat them, or give another `out`")
-            require_same_code(self.folder, make_contact, begun=True)
+            store.require_same_code(self.folder, make_contact, begun=True)
             return
-        require_same_code(self.folder, make_contact, begun=False)
+        store.require_same_code(self.folder, make_contact, begun=False)
         write_text(path, text)  # written last, so that a folder with a configuration also states what code made it
 
     def _unfinished_error(self, error: StoreError) -> DatasetError:
@@ -228,10 +212,10 @@ def read_record(path: Path) -> dict[str, Any]:
 
 def refuse_foreign(folder: Path) -> None:
     """Raise DatasetError if a folder holds files but no configuration of a data set."""
-    found = contents(folder)
+    found = store.contents(folder)
     if CONFIG in found:
         return
-    ours = written_by_us(folder)  # files of a run that was killed before it wrote its configuration
+    ours = store.written_by_us(folder)  # files of a run that was killed before it wrote its configuration
     strange = [name for name in found if name not in ours]
     if strange:
         raise DatasetError(f"{folder}: holds something else ({', '.join(strange[:3])}); give an empty or a new folder with `out`")

@@ -1,4 +1,4 @@
-"""Register of all models by name. To add a model, add a package beside this file and one line below."""
+"""Register of all models by name. To add a model, add a package beside this file and its name below."""
 
 from dataclasses import asdict, fields
 
@@ -30,14 +30,8 @@ def register(model: Model) -> None:
     MODELS[model.name] = model
 
 
-register(VGNN)
-register(STEERED)
-register(TOUCH)
-register(GNN)
-register(TAC_VGNN)
-register(TAC_VGNN_RELEASE)
-register(CNN_V1)
-register(CNN_V2)
+for _model in (VGNN, STEERED, TOUCH, GNN, TAC_VGNN, TAC_VGNN_RELEASE, CNN_V1, CNN_V2):
+    register(_model)
 
 
 def model_named(name: str) -> Model:

@@ -10,6 +10,7 @@ Frames whose move looks executed, and frames whose move does not, have separate 
 """
 
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 import torch
@@ -162,14 +163,11 @@ def calibrate(
     left_out = np.full(y.shape, np.nan)
     if kernel:
         group = None if data.group is None else data.group[train]
+        fit = fit_smooth_processes if model.modes_scaled else partial(fit_processes, seed=config.seed)
         for view in range(prepared.views):
             modes = single[0].modes(prepared.inputs, torch.from_numpy(view * len(data) + train))
             known = y[np.ix_(train, main)]
-            processes, left = (
-                fit_smooth_processes(modes.inputs, known, group=group)
-                if model.modes_scaled
-                else fit_processes(modes.inputs, known, seed=config.seed, group=group)
-            )
+            processes, left = fit(modes.inputs, known, group=group)
             content["kernels"].append(processes.arrays())
             if view == 0:
                 left_out[np.ix_(train, main)] = left

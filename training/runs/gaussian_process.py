@@ -286,11 +286,8 @@ class Processes:
 
     def __call__(self, wanted: Points) -> np.ndarray:
         """(B, K) expected labels of other rows."""
-        found = [
-            kernel.between(kernel.divide_by_lengths(wanted), placed) @ weight
-            for kernel, placed, weight in zip(self.kernels, self._placed, self.weight.T, strict=True)
-        ]
-        return np.stack(found, axis=1)
+        each = zip(self.kernels, self._placed, self.weight.T, strict=True)
+        return np.stack([kernel.between(kernel.divide_by_lengths(wanted), placed) @ weight for kernel, placed, weight in each], axis=1)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The arrays that ``of_arrays`` needs; the terms are not among them."""
@@ -393,9 +390,8 @@ def sample_rows(count: int, seed: int) -> np.ndarray:
 def _fit_processes(
     start: Kernel, points: Points, labels: np.ndarray, rows: np.ndarray, group: np.ndarray | None
 ) -> tuple[Processes, np.ndarray]:
-    return _join_posteriors(
-        [Posterior(climb_likelihood(start, points.rows(rows), label[rows]), points, label, group) for label in labels.T]
-    )
+    kernels = [climb_likelihood(start, points.rows(rows), label[rows]) for label in labels.T]
+    return _join_posteriors([Posterior(kernel, points, label, group) for kernel, label in zip(kernels, labels.T, strict=True)])
 
 
 def _join_posteriors(found: list[Posterior]) -> tuple[Processes, np.ndarray]:

@@ -24,6 +24,8 @@ PLATEAU_PATIENCE = 3
 SCALE_LOSS = 0.05
 # Weight in the total loss of the loss of the prediction that the move was executed. The labels' loss has the weight 1.
 EXECUTED_LOSS = 0.05
+# Parts of a training that have a state of their own.
+STATEFUL = ("network", "optimiser", "plateau")
 
 
 @dataclass(frozen=True)
@@ -137,19 +139,13 @@ class Loop:
     def state(self) -> dict:
         """Everything that is needed to continue the training."""
         keys = ("averaged", "best_weights", "steps", "epochs_done", "best", "since_best", "curves")
-        return {key: getattr(self, key) for key in keys} | {
-            "network": self.network.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
-            "plateau": self.plateau.state_dict(),
-            "generator": self.generator.get_state(),
-            "torch": torch.get_rng_state(),
-        }
+        parts = {key: getattr(self, key).state_dict() for key in STATEFUL}
+        return {key: getattr(self, key) for key in keys} | parts | {"generator": self.generator.get_state(), "torch": torch.get_rng_state()}
 
     def load(self, state: dict) -> None:
         """Continue from a state."""
-        self.network.load_state_dict(state["network"])
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.plateau.load_state_dict(state["plateau"])
+        for key in STATEFUL:
+            getattr(self, key).load_state_dict(state[key])
         self.generator.set_state(state["generator"])
         torch.set_rng_state(state["torch"])
         self.averaged = [value.to(self.device) for value in state["averaged"]]

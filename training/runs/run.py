@@ -68,13 +68,8 @@ class _Lesson:
         executed = torch.from_numpy(data.targets.executed.astype(np.float32)).repeat(views)
         learnt = np.concatenate([view * len(data) + learnt for view in range(views)])  # held-out frames are used in view 0 only
         rows = [torch.from_numpy(each) for each in (learnt, held)]
-        return Loop(
-            network,
-            config.recipe,
-            TrainingRows(self.prepared.inputs, self.scaled.repeat(views, 1), weight, executed, *rows),
-            seed,
-            model.penalty,
-        )
+        taught = TrainingRows(self.prepared.inputs, self.scaled.repeat(views, 1), weight, executed, *rows)
+        return Loop(network, config.recipe, taught, seed, model.penalty)
 
     def keep(self, done: list, loop: Loop | None) -> None:
         """Write the checkpoint and the curves."""
@@ -189,29 +184,16 @@ def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
     """The whole configuration as in ``config.json``; ``data`` are in order, and ``train`` (m,) are the training rows."""
     pins = data.pins
     kept_out = np.setdiff1d(np.arange(len(data)), train)
-    return {
-        "model": config.model,
-        "recipe": asdict(config.recipe),
-        "labels": config.labels,
-        "columns": list(data.targets.names),
-        "units": list(data.targets.units),
-        "helpers": list(config.helpers),
-        "seed": config.seed,
-        "split": config.split,
-        "size": config.size,
-        "rows": {"usable": len(data), "train": len(train)}
-        | identity_of(data, model_named(config.model))
-        | {"kept_out": list(dict.fromkeys(pins.image_name[kept_out].tolist()))},
-        "sensor": pins.sensor.model_dump(mode="json"),
-        "pipeline": {
-            "form": str(pins.form),
-            "graph": "voronoi",
-            "detection": blob_spec(pins.sensor.pipeline, pins.form).model_dump(mode="json"),
-        },
-        "data": ", ".join(map(str, data.folders)),
-        "problems": data.problems,
-        "code": fingerprint(__name__),
-    } | ({"labelled": dict(config.labelled)} if config.labelled else {})
+    rows: dict = {"usable": len(data), "train": len(train)} | identity_of(data, model_named(config.model))
+    rows |= {"kept_out": list(dict.fromkeys(pins.image_name[kept_out].tolist()))}
+    detection = blob_spec(pins.sensor.pipeline, pins.form).model_dump(mode="json")
+    found: dict = {"model": config.model, "recipe": asdict(config.recipe), "labels": config.labels}
+    found |= {"columns": list(data.targets.names), "units": list(data.targets.units), "helpers": list(config.helpers)}
+    found |= {"seed": config.seed, "split": config.split, "size": config.size, "rows": rows}
+    found |= {"sensor": pins.sensor.model_dump(mode="json")}
+    found |= {"pipeline": {"form": str(pins.form), "graph": "voronoi", "detection": detection}}
+    found |= {"data": ", ".join(map(str, data.folders)), "problems": data.problems, "code": fingerprint(__name__)}
+    return found | ({"labelled": dict(config.labelled)} if config.labelled else {})
 
 
 def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray, code: LabelCode) -> tuple[torch.Tensor, np.ndarray, np.ndarray]:
@@ -241,11 +223,8 @@ def fold_rows(train: np.ndarray, seed: int, member: int, group: np.ndarray | Non
 
 def _collect_weights(loop: Loop) -> dict:
     network = loop.result()
-    return {
-        "weights": {key: value.cpu().clone() for key, value in network.state_dict().items()},
-        "held": loop.rows.held,
-        "curves": loop.curves,
-    }
+    weights = {key: value.cpu().clone() for key, value in network.state_dict().items()}
+    return {"weights": weights, "held": loop.rows.held, "curves": loop.curves}
 
 
 def _open_checkpoint(out: Path, resolved: dict) -> dict | None:

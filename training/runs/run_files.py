@@ -51,9 +51,8 @@ KERNELS = "kernels"  # the arrays of the Gaussian processes of the modes, one fo
 KERNEL_LABELS = "kernel_labels"  # the labels that these processes estimate
 BESIDE = "beside"  # the arrays of the Gaussian process that is averaged with the networks, in ``weights.pt``
 SHA256 = "weights_sha256"  # digest of the small copy's weights, in its configuration; older shipped copies have none
-RECORDINGS = (
-    "recordings"  # names of the folders from which the run learnt, in the small copy's configuration; ``rows`` has the number of frames
-)
+# Names of the folders from which the run learnt, in the small copy's configuration. ``rows`` has the number of frames.
+RECORDINGS = "recordings"
 NOT_PACKED = (KERNELS, KERNEL_LABELS, "parameters", "learnt_from")  # entries of ``weights.pt`` that are left out or packed in another form
 
 
@@ -211,11 +210,8 @@ def pack(run: Path, out: Path) -> int:
     if rows:
         kept |= {KERNELS: content[KERNELS], KERNEL_LABELS: torch.tensor(content[KERNEL_LABELS])}
     arrays = _flat(kept)
-    whole = {
-        key
-        for key, value in arrays.items()
-        if value.size <= LARGE or value.dtype == np.int64 or key.startswith((f"{BESIDE}.", f"{KERNELS}."))
-    }
+    of_processes = (f"{BESIDE}.", f"{KERNELS}.")
+    whole = {key for key, value in arrays.items() if value.size <= LARGE or value.dtype == np.int64 or key.startswith(of_processes)}
     small = {key: value if key in whole else value.astype(np.float16) for key, value in arrays.items()}
     small["reference_px"] = content["reference_px"].numpy()  # in full precision, because the graph is made from it
     weights = save({key: np.ascontiguousarray(value) for key, value in small.items()})

@@ -252,12 +252,9 @@ class Predictions:
     def __iter__(self) -> Iterator[tuple[str, PoseEstimate]]:
         """The name of each frame and its estimate."""
         with nullcontext() if self.maps is None else output(self.maps, "*.npz", "*.png"):
-            warm = False
-            for frame in self.recording:
-                if not warm:
-                    # loads or compiles code, which must not count in a frame's time; a copy is used, so that no memory changes
+            for number, frame in enumerate(self.recording):
+                if not number:  # loads or compiles code, which must not count in a frame's time; a copy, so that no memory changes
                     self.estimator.with_history()(frame)
-                    warm = True
                 if self.maps is None or not isinstance(self.estimator, PoseEstimator):
                     yield frame.name, self.estimator(frame)
                     continue
@@ -372,9 +369,7 @@ def _describe_estimate(made: PoseEstimate) -> str:
         return f"not valid: {made.reason}"
     rows = zip(readable_labels(made.names), made.units, made.value, made.low, made.high, strict=True)
     pose = ", ".join(f"{name} {value:.3f} {unit} [{low:.3f}, {high:.3f}]" for name, unit, value, low, high in rows)
-    moved = (
-        "" if made.executed != made.executed else f", move executed with probability {made.executed:.2f}"
-    )  # NaN: the model does not estimate it
+    moved = f", move executed with probability {made.executed:.2f}" if np.isfinite(made.executed) else ""
     kind = f"{made.contact}: " if made.contact else ""
     notes = "".join(f"; {note}" for note in made.notes)
     return f"{kind}{pose}{moved} ({made.ms:.1f} ms){notes}"

@@ -21,7 +21,6 @@ from training.data.targets import ANGLE, DEPTH, TURN, Targets, limits_of
 from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.models.part import Prediction
-from training.runs.assemble import conformal_quantile
 from training.runs.identity import rows_named
 from twin.estimate import readable_labels
 from twin.frames import open_recording
@@ -86,35 +85,16 @@ def measure_errors(made: Prediction, data: Dataset, rows: np.ndarray) -> dict:
         error = np.abs(label_error(np.clip(made.mean, *limits_of(targets.names)), truth, targets.units))
         half_width = made.half_width_raw if kind == "raw" else made.half_width
         inside = np.abs(label_error(made.mean, truth, targets.units)) <= half_width
-        found[kind] = {
-            name: {
-                "mae": float(error[:, k].mean()),
-                "median": float(np.median(error[:, k])),
-                "coverage_90": float(inside[:, k].mean()),
-                "half_width_90": float(half_width[:, k].mean()),
-            }
-            for k, name in enumerate(targets.names)
-        }
+        found[kind] = {}
+        for name, off, covered, wide in zip(targets.names, error.T, inside.T, half_width.T, strict=True):
+            means = {"mae": off.mean(), "median": np.median(off), "coverage_90": covered.mean(), "half_width_90": wide.mean()}
+            found[kind][name] = {key: float(value) for key, value in means.items()}
         found[kind]["bins"] = _bins(error, targets)
     leak = leak_check(made.mean, targets)
     found["leak_slope"], found["leak_not_checked"] = leak.slope, leak.reason
     known = np.isfinite(targets.executed) & np.isfinite(made.executed) & (np.abs(targets.move).max(axis=1) > LARGE_MOVE)
     if known.any():
         found["executed_agreement"] = float(((made.executed > 0.5) == (targets.executed > 0.5))[known].mean())
-    return found
-
-
-def intervals_on(run: Path, data: Dataset, rows: np.ndarray) -> dict[str, np.ndarray]:
-    """Interval quantiles of a finished run, by their names in ``weights.pt``, that contain 90 % of the labels of some rows.
-
-    Give rows from which the run did not learn. ``widen_intervals`` stores the quantiles.
-    """
-    estimator = PoseEstimator.load(run)
-    made, targets = estimator.predict_rows(data, rows), data.targets.rows(rows)
-    found = {}
-    for name, key, half_width in (("quantile", estimator.config["labels"], made.half_width), ("raw_quantile", "raw", made.half_width_raw)):
-        ratio = np.abs(label_error(made.mean, getattr(targets, key), targets.units)) / half_width
-        found[name] = getattr(estimator.ensemble, name) * conformal_quantile(ratio)
     return found
 
 
@@ -156,12 +136,9 @@ def leak_check(mean: np.ndarray, targets: Targets) -> Leak:
 def _bins(error: np.ndarray, targets: Targets) -> dict[str, list[dict]]:
     """MAE of each label by depth, angle and shear, as ``{by: [{from, to, frames, label: mae, ...}]}``."""
     found: dict[str, list[dict]] = {}
+    known = dict(zip(targets.names, targets.corrected.T, strict=True))
     axes = {"depth_mm": (DEPTH, DEPTH_EDGES_MM, False), "angle_deg": (ANGLE, ANGLE_EDGES_DEG, True)}
-    values = {
-        key: (targets.corrected[:, targets.names.index(name)], edges, size)
-        for key, (name, edges, size) in axes.items()
-        if name in targets.names
-    }
+    values = {key: (known[name], edges, size) for key, (name, edges, size) in axes.items() if name in known}
     if np.isfinite(targets.move).all():
         done = np.where(np.isnan(targets.executed), 1.0, targets.executed)
         values["shear_mm"] = (done * targets.move[:, 0], SHEAR_EDGES_MM, True)

@@ -113,17 +113,12 @@ def summary_of(audit: Audit, data: Dataset) -> dict:
     """The findings as numbers and lists of frame names."""
     names = data.pins.image_name
     lost = data.pins.lost.any(axis=1)
-    return {
-        "frames": len(data),
-        **({"not_told": audit.not_assessed} if audit.not_assessed else _moves(audit, data)),
-        "no_contact": names[audit.no_contact].tolist(),
-        "wrong_sign": names[audit.wrong_sign].tolist(),
-        "fit_no_story": names[audit.odd].tolist(),
-        "same_pins_as_an_earlier_frame": names[audit.duplicates != np.arange(len(names))].tolist(),
-        "frames_with_lost_pins": int(lost.sum()),
-        **({} if audit.not_assessed else {"depth_mm_per_mm_of_move_not_executed": audit.depth_per_move, "drift": audit.drift}),
-        "reader": data.problems,
-    }
+    listed = zip(LISTS, (audit.no_contact, audit.wrong_sign, audit.odd, audit.duplicates != np.arange(len(names))), strict=True)
+    found: dict[str, Any] = {"frames": len(data)} | ({"not_told": audit.not_assessed} if audit.not_assessed else _moves(audit, data))
+    found |= {key: names[those].tolist() for key, those in listed} | {"frames_with_lost_pins": int(lost.sum())}
+    if not audit.not_assessed:
+        found |= {"depth_mm_per_mm_of_move_not_executed": audit.depth_per_move, "drift": audit.drift}
+    return found | {"reader": data.problems}
 
 
 def _moves(audit: Audit, data: Dataset) -> dict:
@@ -174,11 +169,8 @@ def _write_evidence(out: Path, audit: Audit, data: Dataset, page: Page) -> list[
     """Write the corrected labels and the picture, and show the picture on the page."""
     labels = _correct_moves(data, audit.executed.round(), audit.depth_per_move)
     chart = write_chart(out / "audit.png", lambda: _evidence_figure(audit, data, labels))
-    page.figures(
-        PagePicture(
-            chart, "Evidence for the findings: which hypothesis fits each frame, corrections of the angle, moves along the table, drift"
-        )
-    )
+    shown = "Evidence for the findings: which hypothesis fits each frame, corrections of the angle, moves along the table, drift"
+    page.figures(PagePicture(chart, shown))
     return [write_table(out / "labels_corrected.csv", _label_rows(audit, data, labels)), chart]
 
 

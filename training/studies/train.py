@@ -194,9 +194,8 @@ def add_domain(run: Path, config: RunConfig, data: Dataset) -> None:
     least = np.median(estimator.predict_rows(data, rows).half_width, axis=0)
     touched = TouchAnswer(pins.reference)
     apart = np.array([touched(nodes_px, lost) < LIKELY for nodes_px, lost in zip(pins.nodes_px, pins.lost, strict=True)])
-    labels = np.where(
-        apart[:, None], np.nan, training_labels(data, config)[rows]
-    )  # a state before first touch has a label, but no pattern of its own
+    # A state before first touch has a label, but no pattern of its own.
+    labels = np.where(apart[:, None], np.nan, training_labels(data, config)[rows])
     group = None if data.group is None else data.group[rows]
     simulated = not config.labelled and all(is_simulated(folder) for folder in data.folders)
     known = learn_domain(
@@ -225,8 +224,7 @@ def add_slip(run: Path, config: RunConfig, parts: Sequence[Dataset]) -> list[str
     slide = sum(np.isfinite(drag.whole_mm) for drag in drags)
     if slide < FEWEST_DRAGS:
         return [
-            f"{slide} contacts are dragged until they slide ({FEWEST_DRAGS} are needed to train slip): slip is not "
-            f"estimated over time; "
+            f"{slide} contacts are dragged until they slide ({FEWEST_DRAGS} are needed to train slip): slip is not estimated over time; "
             "'twin dataset --experiment drag --randomise drag --states all' makes such contacts"
         ]
     sensor = parts[0].pins.sensor

@@ -65,7 +65,7 @@ class SurrogateContacts:
         self._before = np.tile(np.eye(4), (count, 1, 1))  # the poses commanded last
         self._known = np.zeros(count, bool)
         self._gap = np.full((count, len(surrogate.node_mm)), np.inf)
-        self._domain = surrogate.domain
+        self.domain, self.radius_mm = surrogate.domain, self._linear.radius_mm
         self.felt = ContactReading.at_rest(count, self._caps_rest)
 
     def require(self, contact: EpisodeContact) -> None:
@@ -78,8 +78,8 @@ class SurrogateContacts:
             raise outside(f"{touched.name} has a kinetic friction of its own or a shear strength")
         if not (contact.law.given_way is None or isinstance(contact.law.given_way, ArmTurning)):
             raise outside(f"the arm has another compliance for {touched.name}")
-        if friction.static > self._domain["friction"]:
-            raise outside(f"a friction of {friction.static:g}, at most {self._domain['friction']:g} was trained")
+        if friction.static > self.domain["friction"]:
+            raise outside(f"a friction of {friction.static:g}, at most {self.domain['friction']:g} was trained")
         if contact.sensor is not self._sensor and unlike_parts(self._surrogate.about["mechanics"], contact.sensor):
             raise outside(
                 "the skin, gel, lens or pins of the sensor are sampled again; randomise only friction, camera and noise ('moves')"
@@ -112,7 +112,7 @@ class SurrogateContacts:
         """See ``Backend``."""
         linear, T = self._linear, np.ascontiguousarray(T_sensor_object)
         gap, centre = linear.distances(rows, T)
-        most = self._domain["depth_mm"], self._domain["polar_deg"], self._memory
+        most = self.domain["depth_mm"], self.domain["polar_deg"], self._memory
         state = linear.held, self._known, self._before, self._gap
         todo = _plan(rows, (T, gap, centre), (linear.node_mm, linear.radius_mm), most, state)
         for number, row in enumerate(rows.tolist()):
@@ -152,28 +152,13 @@ class SurrogateContacts:
         return self._found[:, : len(self._surrogate.modes)]
 
     @property
-    def caps_at_rest_mm(self) -> FloatArray:
-        """Centres (N, 3) of the pins' caps at rest."""
-        return self._caps_rest
-
-    @property
-    def domain(self) -> dict[str, float]:
-        """As of ``Surrogate``."""
-        return self._domain
-
-    @property
-    def radius_mm(self) -> float:
-        """Radius of the dome."""
-        return self._linear.radius_mm
-
-    @property
     def depth_mm(self) -> FloatArray:
         """Depths (B,) of the objects inside the undeformed domes."""
         return np.maximum(-self._gap.min(axis=1), 0.0)
 
     def _outside(self, depth_mm: float, cosine: float) -> str:
         """The reason why a contact is too deep or too far from the apex."""
-        depth, polar = self._domain["depth_mm"], self._domain["polar_deg"]
+        depth, polar = self.domain["depth_mm"], self.domain["polar_deg"]
         angle = np.degrees(np.arccos(min(cosine, 1.0)))
         if depth_mm > depth:
             return str(outside(f"the object is {depth_mm:.1f} mm inside the dome, at most {depth:.1f} is taken"))

@@ -142,10 +142,6 @@ class _Truths:
         pins = np.stack([g.move_vectors(pins[:, part], PIN_RINGS) for part in range(2)], axis=1)
         return _Truths(g.move_vectors(self.moved, NODE_RINGS), g.move_vectors(self.force, NODE_RINGS), pins.reshape(len(pins), -1))
 
-    def some(self, first: int, every: int) -> "_Truths":
-        """Every ``every``-th state, from ``first`` on."""
-        return _Truths(self.moved[first::every], self.force[first::every], self.pins[first::every])
-
 
 @writes_file("out")
 def distil(
@@ -192,24 +188,16 @@ def require_dome(sensor: SensorSpec) -> None:
         raise OptionError(f"{sensor.name}: its gel is sealed, which a surrogate does not model; use backend='fem'")
 
 
-def fit(
-    sensor: SensorSpec,
-    solved: Sequence[SolvedPath],
-    *,
-    extra: Sequence[SolvedPath] = (),
-    start: Surrogate | None = None,
-    progress: Any = lambda *_: None,
-) -> Surrogate:
+def fit(sensor: SensorSpec, solved: Sequence[SolvedPath], *, start: Surrogate | None = None, progress: Any = lambda *_: None) -> Surrogate:
     """Fit a surrogate to solved paths of the sensor's lattice.
 
-    Every fifth path of ``solved`` is used only to measure the errors; all paths of ``extra`` are trained on. ``start`` is a surrogate of a
-    sensor whose pins are the lattice. If it is given, its modes are used and the training continues from its networks: the corrections of
-    sensors of one family are similar.
+    Every fifth path of ``solved`` is used only to measure the errors. ``start`` is a surrogate of a sensor whose pins are the lattice. If
+    it is given, its modes are used and the training continues from its networks: the corrections of sensors of one family are similar.
     """
     torch.manual_seed(0)
     torch.set_num_threads(1)
-    solved, extra = ([cut(path, sensor.skin.outer_radius_mm) for path in paths] for paths in (solved, extra))
-    seen = [path for number, path in enumerate(solved) if number % JUDGED] + list(extra)
+    solved = [cut(path, sensor.skin.outer_radius_mm) for path in solved]
+    seen = [path for number, path in enumerate(solved) if number % JUDGED]
     kept = [path for number, path in enumerate(solved) if not number % JUDGED]
     skin = compliance_of(lattice_sensor(sensor))
     answer = average_compliance(skin.nodes, sensor.pins.phase_deg)
@@ -223,9 +211,9 @@ def fit(
     answer, flat = softness * answer, softness * flat
     turned = [truths.turn(g) for g in group]
     if start is None:
-        some = [part.some(number, max(len(truths.force) * len(group) // MODE_STATES, 1)) for number, part in enumerate(turned)]
-        pins = np.concatenate([part.pins for part in some])
-        forces = np.concatenate([part.force.reshape(len(part.force), -1) for part in some])
+        every = max(len(truths.force) * len(group) // MODE_STATES, 1)
+        pins = np.concatenate([part.pins[first::every] for first, part in enumerate(turned)])
+        forces = np.concatenate([part.force[first::every] for first, part in enumerate(turned)]).reshape(len(pins), -1)
         modes = _main(np.concatenate([pins, 3 * (pins - forces @ flat.T)]), MODES)
     else:
         modes = _carry_modes(start, sensor, weights)
@@ -245,7 +233,7 @@ def fit(
         part = _turn_states(rows, g)
         seen_by = [part.force.reshape(len(part.force), -1) @ read.T, part.beside, part.within @ view.T]
         inputs.append(np.concatenate(seen_by, axis=1).astype(np.float32))
-        lacks = _pins_and_rest(part, flat)[1] @ modes.T
+        lacks = (part.pins.reshape(len(part.pins), -1) - part.force.reshape(len(part.force), -1) @ flat.T) @ modes.T
         others = np.column_stack([part.area / 100.0, part.slip])
         outputs.append(np.concatenate([lacks, part.wrench - part.linear, others], axis=1).astype(np.float32))
     x, y = np.concatenate(inputs), np.concatenate(outputs)
@@ -263,26 +251,12 @@ def fit(
     layers = _train_network(*given, start.layers if start else (), WIDTH, progress)
     onto = _interpolation(sensor)
     on_pins = np.einsum("np,kcpi->knci", onto, modes.reshape(MODES, 2, -1, 3) / weights[None], optimize=True)
-    about = {
-        "sensor": sensor.name,
-        "mechanics": mechanics_of(sensor),
-        "domain": {"depth_mm": DEEPEST_TAKEN_MM, "polar_deg": POLAR_DEG, "friction": STICKING},
-        "paths": len(solved) + len(extra),
-        "states": int(sum(len(path.T) for path in (*solved, *extra))),
-    }
-    made = Surrogate(
-        about,
-        skin.node_mm,
-        answer.astype(np.float32),
-        on_pins.astype(np.float32),
-        read.astype(np.float32),
-        view,
-        bending,
-        mean,
-        scale,
-        layers,
-        out_scale,
-    ).as_kept()  # so that the errors are those of the file, which rounds the arrays
+    domain = {"depth_mm": DEEPEST_TAKEN_MM, "polar_deg": POLAR_DEG, "friction": STICKING}
+    about = {"sensor": sensor.name, "mechanics": mechanics_of(sensor), "domain": domain, "paths": len(solved)}
+    about |= {"states": int(sum(len(path.T) for path in solved))}
+    answer, on_pins, read = (values.astype(np.float32) for values in (answer, on_pins, read))
+    made = Surrogate(about, skin.node_mm, answer, on_pins, read, view, bending, mean, scale, layers, out_scale)
+    made = made.as_kept()  # so that the errors are those of the file, which rounds the arrays
     about["errors"] = measure_errors(made, sensor, kept)
     return made
 
@@ -361,12 +335,6 @@ def _carry_modes(start: Surrogate, sensor: SensorSpec, weights: FloatArray) -> F
     turn = about_z(np.radians(sensor.pins.phase_deg - start.phase_deg)).astype(np.float32)
     modes = (start.modes @ turn.T).transpose(0, 2, 1, 3) * weights
     return np.ascontiguousarray(modes.reshape(len(modes), -1))
-
-
-def _pins_and_rest(rows: _Samples, flat: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The pins' motion (S, 6 P), and its part that the linear skin's compliance (6 P, 3 M) does not explain."""
-    truth = rows.pins.reshape(len(rows.pins), -1)
-    return truth, truth - rows.force.reshape(len(rows.force), -1) @ flat.T
 
 
 def _truths(sensor: SensorSpec, solved: Sequence[SolvedPath], weights: FloatArray) -> _Truths:
@@ -478,16 +446,10 @@ def _train_network(x: FloatArray, y: FloatArray, gates: FloatArray, counts: Floa
 
     ``counts`` (S,) are the states' weights in the loss. Training starts from the weights and offsets of ``start``, if there are any.
     """
-    net = torch.nn.Sequential(
-        torch.nn.Linear(x.shape[1], width),
-        torch.nn.SiLU(),
-        torch.nn.Linear(width, width),
-        torch.nn.SiLU(),
-        torch.nn.Linear(width, y.shape[1]),
-    )
+    linear = [torch.nn.Linear(*sizes) for sizes in pairwise((x.shape[1], width, width, y.shape[1]))]
+    net = torch.nn.Sequential(linear[0], torch.nn.SiLU(), linear[1], torch.nn.SiLU(), linear[2])
     inputs, wanted, share, count = (torch.from_numpy(np.ascontiguousarray(values)) for values in (x, y, gates[:, None], counts))
     batches = max(len(x) // BATCH, 1)
-    linear = [layer for layer in net if isinstance(layer, torch.nn.Linear)]
     with torch.no_grad():
         for layer, (weight, offset) in zip(linear, start, strict=False):
             layer.weight.copy_(torch.from_numpy(weight))

@@ -56,6 +56,10 @@ class SurrogateError(TwinError):
     """A surrogate's file cannot be used, or there is no surrogate for a sensor."""
 
 
+NAMED = ("modes", "read", "view", "mean", "scale", "out_scale")
+"""Arrays of a file that are attributes of a surrogate."""
+WHOLE = ("mean", "scale", "offset")
+"""Ends of the names of arrays that are not rounded to half precision."""
 FILE = ArrayFile("surrogate", "twin surrogate", version=3, error=SurrogateError)
 
 
@@ -140,20 +144,10 @@ class Surrogate:
         return _of_arrays(self.about, {key: value.astype(np.float32) for key, value in self._arrays().items()})
 
     def _arrays(self) -> dict[str, FloatArray]:
-        whole = {"mean": self.mean, "scale": self.scale, "out_scale": self.out_scale, "bending.scale": self.bending.scale}
-        half = {
-            "modes": self.modes,
-            "read": self.read,
-            "view": self.view,
-            "answer": self.answer[representatives(self.phase_deg)],
-            "bending.straight": self.bending.straight,
-            "bending.modes": self.bending.modes,
-        }
-        for key, value in (layers_to(self.layers) | layers_to(self.bending.layers, "bending")).items():
-            (half if key.endswith("weights") else whole)[key] = value
-        return {key: value.astype(np.float32) for key, value in whole.items()} | {
-            key: value.astype(np.float16) for key, value in half.items()
-        }
+        found = {name: getattr(self, name) for name in NAMED} | {"answer": self.answer[representatives(self.phase_deg)]}
+        found |= {f"bending.{name}": getattr(self.bending, name) for name in ("scale", "straight", "modes")}
+        found |= layers_to(self.layers) | layers_to(self.bending.layers, "bending")
+        return {key: value.astype(np.float32 if key.endswith(WHOLE) else np.float16) for key, value in found.items()}
 
 
 @compiled(fastmath=LOOSE)
@@ -267,19 +261,11 @@ def _of_arrays(about: dict[str, Any], arrays: Mapping[str, FloatArray]) -> Surro
     """The surrogate of a file's arrays, as float32."""
     radius = float(about["mechanics"]["skin"]["outer_radius_mm"])
     phase = float(about["mechanics"]["pins"]["phase_deg"])
-    return Surrogate(
-        about,
-        radius * ring_directions(NODE_RINGS, POLAR_DEG, phase),
-        unfold_compliance(arrays["answer"], phase),
-        arrays["modes"],
-        arrays["read"],
-        arrays["view"],
-        Bending(arrays["bending.scale"], arrays["bending.straight"], layers_from(arrays, "bending"), arrays["bending.modes"]),
-        arrays["mean"],
-        arrays["scale"],
-        tuple((np.asfortranarray(w) if len(w) >= w.shape[1] else w, offset) for w, offset in layers_from(arrays)),  # faster, equal bits
-        arrays["out_scale"],
-    )
+    nodes, answer = radius * ring_directions(NODE_RINGS, POLAR_DEG, phase), unfold_compliance(arrays["answer"], phase)
+    bending = Bending(arrays["bending.scale"], arrays["bending.straight"], layers_from(arrays, "bending"), arrays["bending.modes"])
+    wide = lambda w: np.asfortranarray(w) if len(w) >= w.shape[1] else w  # noqa: E731  (faster, equal bits)
+    layers = tuple((wide(weights), offset) for weights, offset in layers_from(arrays))
+    return Surrogate(about, nodes, answer, bending=bending, layers=layers, **{name: arrays[name] for name in NAMED})
 
 
 def mechanics_of(sensor: SensorSpec) -> dict[str, Any]:

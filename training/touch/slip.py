@@ -312,13 +312,8 @@ def _drag(arrays: dict[str, np.ndarray], nodes_mm: np.ndarray) -> Drag:
     whole = steps.sum(axis=0)[:2]
     size = float(np.linalg.norm(whole))
     slides = arrays["map_slipping_mm2"].sum(axis=1) / np.maximum(arrays["map_touched_mm2"].sum(axis=1), 1e-6)
-    return Drag(
-        arrays["caps_mm"].astype(float),
-        ~arrays["visible"],
-        np.where(dragged, np.minimum(slides, 1.0), 0.0),
-        np.cumsum(np.linalg.norm(steps, axis=1)),
-        whole / size if size > 0 else np.zeros(2),
-    )
+    share, drag_mm = np.where(dragged, np.minimum(slides, 1.0), 0.0), np.cumsum(np.linalg.norm(steps, axis=1))
+    return Drag(arrays["caps_mm"].astype(float), ~arrays["visible"], share, drag_mm, whole / size if size > 0 else np.zeros(2))
 
 
 class CapView:
@@ -340,14 +335,9 @@ class CapView:
         """Modes (T, D) of caps (T, N, 3), of which some are ``lost`` (T, N)."""
         count, reference = len(caps_mm), self._pins.reference
         moved_px = project_in_form(self._pins.sensor, self._pins.form, caps_mm) - self._rest_px
-        columns = {
-            "image_name": np.full(count, ""),
-            "nodes_px": reference.pins_px + moved_px + NOISE_PX * rng.normal(size=moved_px.shape),
-            "area_px2": np.tile(reference.area_px2, (count, 1)),
-            "lost": lost,
-            "valid": np.ones(count, bool),
-            "light": np.zeros(lost.shape),
-        }
+        nodes_px = reference.pins_px + moved_px + NOISE_PX * rng.normal(size=moved_px.shape)
+        columns = {"image_name": np.full(count, ""), "nodes_px": nodes_px, "area_px2": np.tile(reference.area_px2, (count, 1))}
+        columns |= {"lost": lost, "valid": np.ones(count, bool), "light": np.zeros(lost.shape)}
         return self._modes_of(self._pins.with_columns(columns))
 
 

@@ -257,7 +257,7 @@ def _stages(frames: list[Aligned], inside: np.ndarray, studio: _Studio, bar: Bar
 
     def photometry(spec: SensorSpec) -> SensorSpec:
         with bar("fit lights and colours") as step:
-            return fit_photometry(spec, frames, step).spec
+            return fit_photometry(spec, frames, step)
 
     def defocus(spec: SensorSpec) -> SensorSpec:
         shots = studio.shots(spec, frames, "render for the sharpness")

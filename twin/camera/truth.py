@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenes.sensor import SensorSpec, ViewSpec
-from twin.camera.projection import pixel_rays, project
+from twin.camera.projection import pixel_rays, project, project_in_form
 from twin.compiled import compiled
-from twin.frames.forms import frame_size, from_raw
+from twin.frames.forms import frame_size
 from twin.types import BoolArray, FloatArray, Form, PinState
 
 
@@ -33,8 +33,8 @@ class CapTruth:
 
 def cap_truth(spec: SensorSpec, rest: PinState, state: PinState, form: Form) -> CapTruth:
     """Ground truth of a contact for frames of the given form."""
-    caps_px = from_raw(spec.recording, form, project(spec.view, state.caps_mm))
-    rest_px = from_raw(spec.recording, form, project(spec.view, rest.caps_mm))
+    caps_px = project_in_form(spec, form, state.caps_mm)
+    rest_px = project_in_form(spec, form, rest.caps_mm)
     inside = np.all((caps_px >= -0.5) & (caps_px <= np.array(frame_size(spec, form)) - 0.5), axis=1)
     return CapTruth(state.caps_mm, caps_px, rest_px, inside & ~find_occluded(spec.view, 0.5 * spec.pins.cap_diameter_mm, state))
 

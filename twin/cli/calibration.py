@@ -16,7 +16,7 @@ import typer
 
 from twin.cli import FewCommands, app, options
 from twin.cli.command import App
-from twin.cli.options import Formerly, call, load_if_named, print_lines, sensor_with, with_residual_if
+from twin.cli.options import Formerly, call, load_if_named, print_lines
 from twin.errors import OptionError
 from twin.progress import Progress
 from twin.types import FINE, Quality
@@ -134,7 +134,6 @@ def new_sensor(
     """
     from hardware.cameras.choose import open_camera
     from hardware.collect.record import record_frames
-    from scenes import load_experiment
     from scenes.pins import layout_from
     from twin.calibration.go_on import whole_sensor
 
@@ -142,8 +141,7 @@ def new_sensor(
         raise OptionError("give either a folder of frames or `camera`")
     if frames is None:
         frames = record_frames(open_camera(camera), out.with_name(f"{out.stem}-frames"), progress=progress).folder
-    made_of = {"experiment": load_if_named(load_experiment, experiment), "layout": load_if_named(layout_from, layout)}
-    return call(whole_sensor, locals(), **made_of)
+    return call(whole_sensor, locals(), layout=load_if_named(layout_from, layout))
 
 
 calibrate_app = App(
@@ -189,7 +187,7 @@ def calibrate_optics(
     """
     from twin.calibration.optics import calibrate_optics
 
-    return call(calibrate_optics, locals(), sensor=sensor_with(sensor, pipeline))
+    return call(calibrate_optics, locals())
 
 
 @calibrate_app.command("contact", goes_on=True)
@@ -243,13 +241,10 @@ def calibrate_contact(
       twin calibrate contact --sensor mg400-331 --frames recordings/my-surface \\
           --num-labelled 20 --out my-tactip.toml
     """
-    from scenes import load_experiment, load_object
     from twin.calibration.contact.calibrate import calibrate_to_file
     from twin.frames import frames_at
 
-    frames, spec = frames_at(frames, table, no_contact), sensor_with(sensor, pipeline)
-    of, touched = load_experiment(experiment), load_if_named(load_object, obj)
-    return call(calibrate_to_file, locals(), sensor=spec, experiment=of, obj=touched, columns=columns_in(column))
+    return call(calibrate_to_file, locals(), frames=frames_at(frames, table, no_contact), columns=columns_in(column))
 
 
 @app.command("validate")
@@ -292,13 +287,10 @@ def validate(
       twin validate --sensor mg400-331 --frames recordings/surface \\
           --max-frames 40 --out out/validate
     """
-    from scenes import load_experiment, load_object
     from training.studies.validation import validate_contacts
     from twin.frames import frames_at
 
-    frames, spec = frames_at(frames, table, no_contact), sensor_with(sensor, pipeline)
-    of, touched = load_experiment(experiment), load_if_named(load_object, obj)
-    return call(validate_contacts, locals(), sensor=spec, experiment=of, obj=touched, columns=columns_in(column))
+    return call(validate_contacts, locals(), frames=frames_at(frames, table, no_contact), columns=columns_in(column))
 
 
 @app.command("realism")
@@ -364,8 +356,7 @@ def realism(
     from training.studies.realism import compare_with_renders
     from twin.frames import frames_at
 
-    spec = with_residual_if(residual, sensor_with(sensor, pipeline))
-    return call(compare_with_renders, locals(), frames=frames_at(path, table), sensor=spec, test=two_sample)
+    return call(compare_with_renders, locals(), frames=frames_at(path, table), test=two_sample)
 
 
 def _list_conditions(asked: bool) -> None:
@@ -446,13 +437,11 @@ def robustness(
       twin robustness --sensor ur5-331 --frames recordings/mine \\
           --pipeline mine.toml --pipeline mine.py:my_pins --out out/mine
     """
-    from scenes import load_sensor
     from training.studies import degradation
     from twin.evaluation.degradation.plan import SweepPlan, load_plan
 
     sweep = load_if_named(load_plan, conditions) or SweepPlan()
-    plan = call(degradation.DegradationPlan, locals(), sensor=load_sensor(sensor))
-    return degradation.run(plan, out, progress=progress)
+    return degradation.run(call(degradation.DegradationPlan, locals()), out, progress=progress)
 
 
 @app.command("audit")
@@ -488,4 +477,4 @@ def audit(
     from training.studies.label_audit import audit_recording
     from twin.frames import frames_at
 
-    return call(audit_recording, locals(), data=frames_at(data, table, no_contact), sensor=sensor_with(sensor, pipeline))
+    return call(audit_recording, locals(), data=frames_at(data, table, no_contact))

@@ -110,7 +110,7 @@ def graph(
     from twin.frames import frames_at
     from twin.pins.graph_files import write_graphs_of
 
-    return call(write_graphs_of, locals(), path=frames_at(path, table, no_contact), sensor=sensor_with(sensor, pipeline))
+    return call(write_graphs_of, locals(), path=frames_at(path, table, no_contact))
 
 
 @app.command("tune")
@@ -143,11 +143,10 @@ def tune(
     Example:
       twin tune --sensor ur5-331 --frames recordings/mine --out mine.toml
     """
-    from scenes import load_sensor
     from twin.frames import frames_at
     from twin.pins.detectors.tune_files import tune_on_frames
 
-    return call(tune_on_frames, locals(), path=frames_at(frames, table, no_contact), sensor=load_sensor(sensor))
+    return call(tune_on_frames, locals(), path=frames_at(frames, table, no_contact))
 
 
 # Exit code of 'twin check' if the sensor has failed. It differs from those of a failure (1) and of a wrong command line (2).

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from twin.cli import app, options
-from twin.cli.options import Formerly, call, each_once, finite, load_if_named, names_in, print_lines, sensor_with, with_residual_if
+from twin.cli.options import Formerly, call, each_once, finite, names_in, print_lines
 from twin.errors import OptionError
 from twin.progress import Progress
 from twin.types import FINE, Quality
@@ -101,12 +101,10 @@ def make_dataset(
       twin dataset --experiment edge-2d --sensor ur5-331 --count 200 \\
           --out sim/edge --scheduler tcp://192.168.0.10:8786
     """
-    from scenes import load_experiment, load_object, load_randomisation, load_sensor
+    from scenes import load_experiment
     from training.generation.run import config_for, simulate_dataset
 
-    spec, of = with_residual_if(residual, load_sensor(sensor)), load_experiment(experiment, wide=wide)
-    touched, randomisation = load_if_named(load_object, obj), load_if_named(load_randomisation, randomise)
-    config = call(config_for, locals(), sensor=spec, experiment=of, obj=touched)
+    config = call(config_for, locals(), experiment=load_experiment(experiment, wide=wide))
     return call(simulate_dataset, locals())
 
 
@@ -193,7 +191,7 @@ def train(
     from training.studies.train import train_model
 
     recordings, kept_out = require_one_recording(data, table, no_contact), None if split < 0 else split
-    return call(train_model, locals(), sensor=sensor_with(sensor, pipeline), split=kept_out)
+    return call(train_model, locals(), split=kept_out)
 
 
 @app.command("evaluate")
@@ -324,10 +322,9 @@ def make_surrogate(
     Example:
       twin surrogate --sensor mg400-331 --out mine.safetensors
     """
-    from scenes import load_sensor
     from training.surrogate.fit import distil
 
-    return call(distil, locals(), sensor=load_sensor(sensor))
+    return call(distil, locals())
 
 
 @app.command("demonstrate", goes_on=True)

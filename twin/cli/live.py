@@ -39,10 +39,15 @@ Record = Annotated[bool, typer.Option("--record", help="keep every frame and ste
 NoiseSeed = Annotated[int, typer.Option("--seed", min=0, help="seed of the twin's noise")]
 KnownPlace = Annotated[bool, typer.Option("--known-place", help="the object stands exactly at --servo: measure errors against it")]
 ArmOption = Annotated[
-    str, typer.Option("--arm", metavar="A", help="simulated, simulated:4, mg400[-lenient]:ADDRESS[:DASHBOARD_PORT], magician:PORT")
+    str,
+    typer.Option(
+        "--arm",
+        metavar="A",
+        help="simulated, simulated:4, mg400[-lenient]:ADDRESS[:DASHBOARD_PORT], magician:PORT, ros2:twist, ros2:pose, ur:ADDRESS",
+    ),
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="check and print the plan, without motion")]
-Limits = Annotated[str | None, typer.Option("--safety", help="safety limits: mg400, magician, or a TOML file"), Formerly("limits")]
+Limits = Annotated[str | None, typer.Option("--safety", help="limits: mg400, magician, ros2, ur, or a TOML file"), Formerly("limits")]
 Ros2 = Annotated[
     str | None, typer.Option("--ros2", metavar="NAME", help="publish frames, pins and estimates as ROS 2 topics /NAME/..., such as tactip")
 ]
@@ -150,11 +155,9 @@ def collect(
           --experiment surface-2d --count 5000 --out data/real
     """
     from hardware.collect.collect import CollectPlan, collect_frames
-    from scenes import load_experiment, load_object, load_sensor, load_servo
+    from scenes import load_experiment, load_object
 
-    asked = load_experiment(experiment)
-    things = {"sensor": load_sensor(sensor), "obj": load_object(obj or asked.object), "servo": load_servo(servo)}
-    plan = call(CollectPlan, locals(), experiment=asked, **things)
+    plan = call(CollectPlan, locals(), obj=load_object(obj or load_experiment(experiment).object))
     with signals_as_ctrl_c():
         return collect_frames(plan, out, progress=progress)
 
@@ -223,11 +226,10 @@ def servo(
     The exit code is 1 if it ended early.
     """
     from hardware.servo.following import FollowPlan, follow
-    from scenes import load_object, load_servo
     from training.estimate.loading import load_with_history
 
     stream_hz = rate if stream else None
-    plan = call(FollowPlan, locals(), obj=load_object(obj), servo=load_servo(servo))
+    plan = call(FollowPlan, locals())
     with signals_as_ctrl_c():
         followed = follow(plan, load_with_history(model), out, about={"model": str(model)}, progress=progress)
     return followed  # type: ignore[return-value]  # a dry run has nothing but its lines
@@ -268,10 +270,9 @@ def run_policy(
           --camera http://127.0.0.1:8081/stream.mjpg --arm mg400:127.0.0.1
     """
     from hardware.servo.following import FollowPlan, follow, load_for_outlines
-    from scenes import load_object, load_servo
     from training.environments.policy_domain import contacts_of
 
-    plan = call(FollowPlan, locals(), obj=load_object(obj), servo=load_servo(servo))
+    plan = call(FollowPlan, locals())
     with signals_as_ctrl_c():
         followed = follow(plan, load_for_outlines(policy, contacts_of), out, about={"policy": str(policy)}, progress=progress)
     return followed  # type: ignore[return-value]  # a dry run has nothing but its lines
@@ -349,6 +350,51 @@ def magician(
     call(emulate_magician, locals(), faults=faults_of(fault, FAULTS))
 
 
+@emulate.command("ros2")
+def ros2_arm(
+    form: Annotated[str, typer.Option(help="commands: twist, as for MoveIt Servo, or pose, as for a cartesian controller")] = "twist",
+    namespace: Annotated[str, typer.Option(help="namespace of its topics")] = "",
+    fault: FaultOption = None,
+) -> None:
+    """Emulate an arm behind ROS 2.
+
+    It publishes current_pose and joint_states, and obeys servo_node/delta_twist_cmds or target_pose.
+
+    In Python: open_arm("ros2:twist").
+
+    \b
+    Example:
+      twin emulate ros2 --namespace left
+      twin servo --object can --arm ros2:twist,namespace=left --out out/servo
+    """
+    from hardware.emulators.ros2 import FAULTS, emulate_ros2
+
+    call(emulate_ros2, locals(), faults=faults_of(fault, FAULTS))
+
+
+@emulate.command("ur")
+def ur(
+    host: Annotated[
+        str, typer.Option(help="address to listen on; a second emulated UR needs another one, such as 127.0.0.2")
+    ] = "127.0.0.1",
+    fault: FaultOption = None,
+    time_scale: TimeScale = 1.0,
+) -> None:
+    """Emulate a Universal Robots UR5, as far as ur_rtde uses it.
+
+    The ports are 29999 (dashboard), 30003 (script) and 30004 (RTDE).
+
+    In Python: open_arm("ur:127.0.0.1").
+
+    \b
+    Example:
+      twin emulate ur
+    """
+    from hardware.emulators.ur import FAULTS, emulate_ur
+
+    call(emulate_ur, locals(), faults=faults_of(fault, FAULTS))
+
+
 @emulate.command("camera")
 def camera(
     arm: Annotated[str, typer.Option(metavar="A", help="mg400:ADDRESS[:DASHBOARD_PORT]")],
@@ -374,7 +420,5 @@ def camera(
     """
     from hardware.emulators.camera import FAULTS
     from hardware.emulators.twin_camera import emulate_camera
-    from scenes import load_object, load_sensor, load_servo
 
-    faults, spec = faults_of(fault, FAULTS), load_sensor(sensor)
-    call(emulate_camera, locals(), sensor=spec, obj=load_object(obj), servo=load_servo(servo))
+    call(emulate_camera, locals(), faults=faults_of(fault, FAULTS))

@@ -30,12 +30,8 @@ class Formerly:
     name: str
 
 
-def usable_cores() -> int:
-    """Number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-CORES = usable_cores()
+# Number of cores that this process may use.
+CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 # The largest seed of weights and splits. It is the constant of training.runs.config, which is not imported because it would load PyTorch.
 MOST_SEED = 2**32 - 1
 # Largest number of CPU threads. More threads have never made a training faster, and many more can't be started.
@@ -125,6 +121,7 @@ INSIDE = {
     "num_labelled": "labels",
     "pipeline": "pipelines",
     "push": "pushes",
+    "randomise": "randomisation",
     "safety": "limits",
     "sim": "simulated",
     "workers": "processes",
@@ -134,13 +131,25 @@ INSIDE = {
 def call(function: Callable[..., Made], given: Mapping[str, Any], **others: Any) -> Made:
     """Call a function, or make a plan, with those of a command's options (its ``locals()``) that are arguments of it.
 
-    An option that was not given leaves the function's default. ``others`` are arguments that differ from the option.
+    An option that was not given leaves the function's default. For an argument that is a specification, or a tuple of them, the option has
+    names; a sensor gets the pin detection and the residual network that further options ask for. ``others`` are arguments that differ from
+    the option.
     """
+    import scenes
+
     takes, arguments = inspect.signature(function).parameters, {}
+    tuning = given["pipeline"] if isinstance(given.get("pipeline"), Path) else None
     for name, value in given.items():
         name = name if name in takes else INSIDE.get(name, name)
-        if name in takes and value is not None:
-            arguments[name] = tuple(value) if isinstance(value, list) else value
+        if name not in takes or name in others or value is None:
+            continue
+        arguments[name] = tuple(value) if isinstance(value, list) else value
+        if kind := re.search(r"(Sensor|Object|Experiment|Randomisation|Servo)Spec", str(takes[name].annotation)):
+            load = getattr(scenes, f"load_{kind[1].lower()}")
+            several = "tuple[" in str(takes[name].annotation)
+            arguments[name] = tuple(map(load, names_in(value))) if several else load(value)
+            if kind[1] == "Sensor":
+                arguments[name] = sensor_with(value, tuning, residual=given.get("residual", False))
     return function(**arguments | others)
 
 
@@ -149,20 +158,15 @@ def load_if_named(load: Callable[[Given], Spec], name: Given | None) -> Spec | N
     return load(name) if name else None
 
 
-def sensor_with(name: str, tuning: Path | None) -> "SensorSpec":
-    """The sensor, with the pin detection of a 'twin tune' file if one is given."""
+def sensor_with(name: str, tuning: Path | None = None, *, residual: bool = False) -> "SensorSpec":
+    """The sensor, with the pin detection of a 'twin tune' file if one is given, and with its residual network if wanted."""
     from scenes import load_sensor
+    from twin.camera.residual import with_residual
     from twin.pins import load_detector, with_detector
 
     spec = load_sensor(name)
-    return spec if tuning is None else with_detector(spec, load_detector(tuning))
-
-
-def with_residual_if(wanted: bool, sensor: "SensorSpec") -> "SensorSpec":
-    """The sensor, with its residual network switched on if ``wanted``."""
-    from twin.camera.residual import with_residual
-
-    return with_residual(sensor) if wanted else sensor
+    spec = with_detector(spec, load_detector(tuning)) if tuning is not None else spec
+    return with_residual(spec) if residual else spec
 
 
 NAMED_OTHERWISE = {"obj": "object"}

@@ -178,9 +178,7 @@ def render_contact_command(
     Example:
       twin render --sensor ur5-331 --object edge --indent-mm 3 --out out/edge
     """
-    from scenes import load_object, load_sensor
     from twin.mechanics.path import ContactPose
     from twin.one_contact import render_contact
 
-    pose = call(ContactPose, locals())
-    return call(render_contact, locals(), sensor=load_sensor(sensor), obj=load_object(obj))
+    return call(render_contact, locals(), pose=call(ContactPose, locals()))

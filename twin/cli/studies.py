@@ -13,7 +13,7 @@ import typer
 
 from twin.cli import FewCommands, app, options
 from twin.cli.command import App
-from twin.cli.options import Formerly, call, each_once, finite, load_if_named, names_in
+from twin.cli.options import Formerly, call, each_once, finite, names_in
 from twin.progress import Progress
 from twin.types import FINE
 
@@ -51,12 +51,9 @@ def study_servo_command(
     Writes to --out: a folder for each model and object as 'twin servo' writes it, index.html, study.csv, study.png.
     """
     from hardware.servo.following import ServoStudyPlan, study_servo
-    from scenes import load_object, load_servo
     from training.estimate.loading import load_by_name
 
-    of_name, things = load_by_name(models), tuple(map(load_object, names_in(objects)))
-    plan = call(ServoStudyPlan, locals(), models=of_name, objects=things, servo=load_servo(servo))
-    return study_servo(plan, out, progress=progress)
+    return study_servo(call(ServoStudyPlan, locals(), models=load_by_name(models)), out, progress=progress)
 
 
 TRAIN = "plane,ball-10,sphere,ball-40,ball-80,hexagon-rod,square-rod,round-bar,triangle-rod"
@@ -106,13 +103,9 @@ def study_objects(
     and tests/, a data set for each object (as 'twin dataset' writes them);
     objects.csv, index.html.
     """
-    from scenes import load_experiment, load_object, load_randomisation, load_sensor
     from training.studies import objects
 
-    of, randomisation = load_experiment(experiment), load_randomisation(randomise)
-    things = {"train": tuple(map(load_object, names_in(train))), "unseen": tuple(map(load_object, names_in(unseen)))}
-    plan = call(objects.ObjectsPlan, locals(), sensor=load_sensor(sensor), experiment=of, **things)
-    return objects.run(plan, out, progress=progress)
+    return objects.run(call(objects.ObjectsPlan, locals()), out, progress=progress)
 
 
 @study.command("sim-to-real", goes_on=True)
@@ -181,12 +174,9 @@ def study_sim_to_real(
 
     Writes to --out: sim_only/, sim_plus_real/, sim_taught/ and real_N/, each a RUN; study.csv and index.html.
     """
-    from scenes import load_experiment, load_sensor
     from training.studies import sim_to_real
 
-    of, wider = load_experiment(experiment), load_if_named(load_experiment, contacts)
-    plan = call(sim_to_real.SimToRealPlan, locals(), sensor=load_sensor(sensor), experiment=of, contacts=wider)
-    return sim_to_real.run(plan, out, progress=progress)
+    return sim_to_real.run(call(sim_to_real.SimToRealPlan, locals()), out, progress=progress)
 
 
 def numbers_in(text: str, option: str, least: int) -> tuple[int, ...]:
@@ -245,10 +235,9 @@ def study_tac_vgnn(
     Writes to --out: models.csv, graphs.csv, efficiency.csv, contacts.csv,
     curves.png, efficiency.png, contacts.png, index.html, runs/.
     """
-    from scenes import load_sensor
     from training.studies import tac_vgnn
     from training.studies.train import columns_of
 
     lists = {"models": tuple(names_in(models)), "seeds": numbers_in(seeds, "--seeds", 0), "batches": numbers_in(batches, "--batches", 1)}
-    plan = call(tac_vgnn.TacVgnnPlan, locals(), sensor=load_sensor(sensor), target=columns_of(target), **lists)
+    plan = call(tac_vgnn.TacVgnnPlan, locals(), target=columns_of(target), **lists)
     return tac_vgnn.run(plan, out, progress=progress)

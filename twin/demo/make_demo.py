@@ -13,15 +13,15 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from scenes import load_object, load_sensor
-from twin.camera.projection import project
-from twin.frames.forms import form_named, from_raw
+from twin.camera.projection import project, project_in_form
+from twin.frames.forms import form_named
 from twin.frames.images import write_image
 from twin.mechanics.path import ContactPose
 from twin.objects import build_field
 from twin.one_contact import look_at
 from twin.pins.graph import make_graph
 from twin.pins.labelling.reference import nominal_reference
-from twin.progress import Progress, Step, silent, stage, unheard
+from twin.progress import Progress, Step, report_each, silent, stage, unheard
 from twin.report import plots
 from twin.report.charts import new_figure, write_chart
 from twin.report.page import Page, PagePicture, code, sentence
@@ -112,14 +112,14 @@ def depth_table(sensor: str, *, progress: Step = unheard) -> list[DepthRow]:
     rest_area_px2 = make_graph("voronoi", rest_px, outmost=outmost).area_px2
     middle = np.argsort(np.hypot(*(rest_px - rest_px[0]).T))[: spec.pins.count // 8]
     rows = []
-    for k, (indent_mm, measured_px) in enumerate(zip(TABLE_INDENTS_MM, MEASURED_DISPLACEMENT_PX[sensor], strict=True)):
+    pairs = list(zip(TABLE_INDENTS_MM, MEASURED_DISPLACEMENT_PX[sensor], strict=True))
+    for indent_mm, measured_px in report_each(pairs, progress):
         state = simulator.press(load_object("plane"), ContactPose(indent_mm=indent_mm))
         caps_px = project(spec.view, state.caps_mm)
         areas = make_graph("voronoi", caps_px, outmost=outmost).area_px2
         change = 100 * float(np.mean(areas[middle] / rest_area_px2[middle]) - 1)
         moved = float(np.hypot(*(caps_px - rest_px).T).mean())
         rows.append(DepthRow(indent_mm, moved, measured_px, change, float(state.force_n[2])))
-        progress((k + 1) / len(TABLE_INDENTS_MM))
     return rows
 
 
@@ -177,11 +177,9 @@ def run_demo(out: Path, *, progress: Progress = silent) -> Demo:
 
     motion_sensor = CONTACTS[0][0]
     start = perf_counter()
-    looks = []
     with bar(f"{motion_sensor}: motions along Z, X and Y") as step:
-        for k, (title, pose) in enumerate(MOTIONS):
-            looks.append((title, run_contact(simulators[motion_sensor], "plane", pose, Form.RAW).look))
-            step((k + 1) / len(MOTIONS))
+        moved = report_each(MOTIONS, step)
+        looks = [(title, run_contact(simulators[motion_sensor], "plane", pose, Form.RAW).look) for title, pose in moved]
         add_motions(page, write_chart(pictures / "motions.png", lambda: motion_figure(looks)))
     seconds["motions"] = perf_counter() - start
 
@@ -204,7 +202,7 @@ def _add_contact(page: Page, simulator: Simulator, result: ContactResult, pictur
     spec = simulator.spec
     touched = result.state.contact_mm
     contact_mm = touched.mean(axis=0) if len(touched) else np.array([0, 0, spec.skin.apex_mm])
-    contact_px = from_raw(spec.recording, result.look.frame.form, project(spec.view, contact_mm[None]))[0]
+    contact_px = project_in_form(spec, result.look.frame.form, contact_mm[None])[0]
     height, width = result.raw.frame.image.shape[:2]
     title = f"{spec.name} against {result.object_name}"
     page.section(title, f"{spec.description}. {load_object(result.object_name).description}, pressed in by {result.pose.indent_mm:g} mm.")

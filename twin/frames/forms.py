@@ -4,17 +4,16 @@ A recording is the camera's frame cropped, thresholded and resized at capture. W
 size (w, h), and pixel centres at integers, ``x_rec = (x_raw - x0 + 0.5) w / (x1 - x0) - 0.5``; likewise for y.
 """
 
-from collections import Counter
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from statistics import mode
 
 import cv2
 import numpy as np
 
 from scenes.sensor import BlobSpec, PipelineSpec, Polarity, RecordingSpec, SensorSpec
-from twin.errors import FrameError
+from twin.errors import ErrorsAs, FrameError
 from twin.frames.images import bits_used, decode, to_eight_bits
 from twin.types import Form
 
@@ -39,8 +38,6 @@ BLACK_BELOW, WHITE_ABOVE = 16, 239
 COLOURLESS_BELOW = 4.0
 # Number of frames by which the size and form of a recording are recognised.
 VOTES = 25
-
-Thing = TypeVar("Thing", bound=Hashable)
 
 
 def raw_to_recording(recording: RecordingSpec | None, raw_px: np.ndarray) -> np.ndarray:
@@ -74,10 +71,8 @@ def form_named(name: str) -> Form:
     FrameError
         There is no such form.
     """
-    try:
+    with ErrorsAs(ValueError, lambda error: FrameError(f"no form is called {name!r}; there are: {', '.join(Form)}")):
         return Form(name)
-    except ValueError:
-        raise FrameError(f"no form is called {name!r}; there are: {', '.join(Form)}") from None
 
 
 def frame_size(spec: SensorSpec, form: Form) -> tuple[int, int]:
@@ -211,10 +206,8 @@ def form_of(image: np.ndarray, name: str, spec: SensorSpec | None, form: Form | 
         form = form_named(form)
     if spec is None:
         return form or (Form.PROCESSED if is_two_level(image) else Form.RAW)
-    try:
+    with ErrorsAs(FrameError, lambda error: FrameError(f"{name}: {error}")):
         told = recognise_form(spec, image)
-    except FrameError as error:
-        raise FrameError(f"{name}: {error}") from None
     if form is None:
         return told
     expected = known_sizes(spec).get(form)
@@ -249,9 +242,9 @@ def common_kind(files: list[Path], spec: SensorSpec | None, form: Form | None) -
     if not votes:
         raise FrameError(f"no usable frame among {len(files)}; the first: {reasons[0]}")
     kinds = [votes[k] for k in sorted(votes)]
-    size = _most([kind.size_px for kind in kinds])
+    size = mode(kind.size_px for kind in kinds)
     kinds = [kind for kind in kinds if kind.size_px == size]
-    return FrameKind(_most([kind.form for kind in kinds]), size, max(kind.bits for kind in kinds))
+    return FrameKind(mode(kind.form for kind in kinds), size, max(kind.bits for kind in kinds))
 
 
 def _corner_and_scale(recording: RecordingSpec | None) -> tuple[np.ndarray, np.ndarray]:
@@ -265,8 +258,3 @@ def _corner_and_scale(recording: RecordingSpec | None) -> tuple[np.ndarray, np.n
 def _size_px(image: np.ndarray) -> tuple[int, int]:
     """(width, height) of an image."""
     return image.shape[1], image.shape[0]
-
-
-def _most(things: list[Thing]) -> Thing:
-    """The most frequent thing; of equally frequent things the first."""
-    return Counter(things).most_common(1)[0][0]

@@ -11,7 +11,6 @@ import os
 import re
 import struct
 import threading
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,8 +23,6 @@ from twin.store import write_bytes
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
 """First bytes of a PNG file."""
-PNG_CHUNK_FRAME = 12
-"""Bytes of a PNG chunk without its data: length, kind and checksum, 4 bytes each."""
 LARGEST_BYTES = 500_000_000
 """Largest size of a picture's file, bytes: ten times an uncompressed 16-bit colour picture of an 8-megapixel camera."""
 SEVERAL_FROM_START = (b"II*\0", b"MM\0*", b"RIFF", b"GIF8")
@@ -123,18 +120,14 @@ def _read_levels(path: Path) -> tuple[np.ndarray, str]:
         data = read_regular(path, LARGEST_BYTES)
     if not data:
         raise FrameError(f"{path.name}: the file is empty; copy it again")
-    try:
+    with ErrorsAs(FrameError, lambda error: FrameError(f"{path.name}: {error}")):
         image, odd = _decode_picture(data)
-    except FrameError as error:
-        raise FrameError(f"{path.name}: {error}") from None
     several = "holds several pictures; only the first is read" if _holds_several(path, data) else ""
     return image, "; ".join(filter(None, [several, odd]))
 
 
 def _decode_picture(data: bytes) -> tuple[np.ndarray, str]:
     """Levels as of ``decode`` from a picture's bytes, and a note on irregularities that its decoder reported ("" if there are none)."""
-    if data.startswith(PNG_START) and (torn := _png_fault(data)):
-        raise FrameError(f"{torn}; copy it again")
     orientation, place = _orientation(data)
     if place and data[:4] in TIFF_STARTS:  # OpenCV turns TIFF pictures, whatever it is told
         data = data[:place] + struct.pack(f"{TIFF_STARTS[data[:4]]}H", UPRIGHT) + data[place + 2 :]
@@ -143,6 +136,8 @@ def _decode_picture(data: bytes) -> tuple[np.ndarray, str]:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
+    if image is None and data.startswith(PNG_START):
+        raise FrameError(f"{'damaged' if b'IEND' in data else 'truncated'} PNG ({len(data)} bytes); copy it again")
     if image is None:
         raise FrameError("not a readable picture (broken or unknown format); copy or convert it again")
     if image.dtype not in (np.uint8, np.uint16):
@@ -173,33 +168,9 @@ def _orientation(data: bytes) -> tuple[int, int]:
 def _holds_several(path: Path, data: bytes) -> bool:
     """Whether a picture's file is an animation or has several pages."""
     if data.startswith(PNG_START):
-        return any(kind == b"acTL" for kind, _, _ in _png_chunks(data))
+        return b"acTL" in data[: data.find(b"IDAT")]  # the chunk that makes it an animation, before the first picture
     with overheard():
         return data.startswith(SEVERAL_FROM_START) and cv2.imcount(str(path)) > 1
-
-
-def _png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
-    """Kind, start and end of each whole chunk of a PNG, up to IEND. A chunk includes its length, kind and checksum."""
-    start = len(PNG_START)
-    while start + PNG_CHUNK_FRAME <= len(data):
-        end = start + PNG_CHUNK_FRAME + int.from_bytes(data[start : start + 4], "big")
-        if end > len(data):
-            return
-        kind = data[start + 4 : start + 8]
-        yield kind, start, end
-        if kind == b"IEND":
-            return
-        start = end
-
-
-def _png_fault(data: bytes) -> str:
-    """The fault in the chunks of a PNG; "" if they are whole. Data after the last chunk are ignored."""
-    kind = b""
-    for kind, start, end in _png_chunks(data):
-        critical = kind[:1].isupper()
-        if critical and zlib.crc32(data[start + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
-            return f"damaged PNG (checksum of its {kind.decode('ascii', 'replace')} chunk)"
-    return "" if kind == b"IEND" else f"truncated PNG ({len(data)} bytes, its end is missing)"
 
 
 def bits_used(image: np.ndarray) -> int:

@@ -195,23 +195,17 @@ def _rows(path: Path, info: dict[str, Any], numbered: list[str]) -> tuple[dict[s
 def _in_videos(path: Path, info: dict[str, Any], feature: str, rows: dict[str, list[Any]]) -> list[tuple[Path, int, int]]:
     """Video, -1, and number in the video of each frame."""
     episodes: dict[int, Episode] = {}
-    at = f"videos/{feature}"
-    keys = [f"{at}/chunk_index", f"{at}/file_index", f"{at}/from_timestamp"]
+    keys = [f"videos/{feature}/{key}" for key in ("chunk_index", "file_index", "from_timestamp")]
     for file in sorted(path.glob(EPISODES)):
         with _parquet(file) as parquet:
             episodes |= {row["episode_index"]: row for row in parquet.read(["episode_index", *keys]).to_pylist()}
+    places = []
     try:
-        files = {
-            number: (
-                path / info["video_path"].format(video_key=feature, chunk_index=row[keys[0]], file_index=row[keys[1]]),
-                round(row[keys[2]] * info["fps"]),
-            )
-            for number, row in episodes.items()
-        }
-        return [
-            (files[episode][0], -1, files[episode][1] + frame)
-            for episode, frame in zip(rows["episode_index"], rows["frame_index"], strict=True)
-        ]
+        for episode, frame in zip(rows["episode_index"], rows["frame_index"], strict=True):
+            chunk, number, begins_s = (episodes[episode][key] for key in keys)
+            video = path / info["video_path"].format(video_key=feature, chunk_index=chunk, file_index=number)
+            places.append((video, -1, round(begins_s * info["fps"]) + frame))
+        return places
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise FrameError(f"{path}: does not say where the video of an episode is ({error!r}); {DAMAGED}") from error
 

@@ -217,17 +217,16 @@ class Recording:
 def _open_video(path: Path, spec: SensorSpec | None, form: Form | None) -> Recording:
     video = open_video(path)
     names = [f"{path.stem}_{k:06d}" for k in range(video.count)]
-    size_px = (video.first.shape[1], video.first.shape[0])
-    return Recording(path, form_of(video.first, path.name, spec, form), names, size_px, problems=video.problems, _video=video)
+    told = form_of(video.first, path.name, spec, form)
+    return Recording(path, told, names, video.first.shape[1::-1], problems=video.problems, _video=video)
 
 
 def _open_dataset(path: Path, spec: SensorSpec | None, form: Form | None, table: Path | None) -> Recording:
     if table is not None and not Path(table).is_relative_to(path):
         raise FrameError(f"{path}: a LeRobot data set holds its own labels; leave out {table}")
     found = open_lerobot(path)
-    size_px = (found.first.shape[1], found.first.shape[0])
     told = form_of(found.first, path.name, spec, form)
-    recording = Recording(path, told, found.names, size_px, found.labels, problems=found.problems, _dataset=found)
+    recording = Recording(path, told, found.names, found.first.shape[1::-1], found.labels, problems=found.problems, _dataset=found)
     recording.take_metadata([path / INFO.parent])
     recording.take_reference([*references_in(path), *sorted((path / RESTS).glob("*.png"))])
     return recording

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import zarr
 
-from twin.errors import FrameError
+from twin.errors import ErrorsAs, FrameError
 from twin.types import Form
 
 # Zarr group with the exact values of the frames.
@@ -33,11 +33,10 @@ def open_truth(folder: Path) -> tuple[zarr.Group, str, Form]:
         The data set is damaged or not finished.
     """
     path = folder / TRUTH
-    try:
+    # damaged metadata can raise any exception in zarr
+    with ErrorsAs(Exception, lambda error: FrameError(f"{path}: damaged, or of no finished data set; {AGAIN}")):
         truth = zarr.open_group(path, mode="r")
         return truth, str(truth.attrs["sensor"]), Form(str(truth.attrs["form"]))
-    except Exception as error:  # damaged metadata can raise any exception in zarr
-        raise FrameError(f"{path}: damaged, or of no finished data set; {AGAIN}") from error
 
 
 def row_of(truth: zarr.Group) -> dict[str, int]:

@@ -17,7 +17,7 @@ import numpy as np
 from scenes.base import SpecError
 from scenes.body import SkinSpec
 from scenes.pins import PinsSpec
-from twin.geometry.chart import Chart, Focus, RectangleChart, disc_of_square, square_of_disc
+from twin.geometry.chart import Chart, Focus, RectangleChart, disc_of_square
 from twin.types import BoolArray, ComplexArray, FloatArray
 
 _GOLDEN_RAD = np.pi * (1 + np.sqrt(5))
@@ -81,10 +81,6 @@ class SkinShape(ABC):
     def disc(self, place: ComplexArray) -> ComplexArray:
         """Points (k,) of the unit disc to which places are mapped; the rim has the radius 1."""
         return place
-
-    def of_disc(self, disc: ComplexArray) -> ComplexArray:
-        """Inverse of ``disc``."""
-        return disc
 
     def even(self, count: int, *, turn_rad: float = 0.0) -> ComplexArray:
         """Places that are evenly distributed over the outside; ``count`` is their number on a whole sphere.
@@ -297,9 +293,6 @@ class RectangularPad(Pad):
 
     def disc(self, place: ComplexArray) -> ComplexArray:
         return disc_of_square(np.column_stack([place.real, place.imag]))
-
-    def of_disc(self, disc: ComplexArray) -> ComplexArray:
-        return _complex(*square_of_disc(disc).T)
 
     def even(self, count: int, *, turn_rad: float = 0.0) -> ComplexArray:
         width, height = self.skin.half_size_mm

@@ -132,10 +132,9 @@ def sample_mesh(mesh: trimesh.Trimesh) -> MeshField:
 
 def read_mesh(file: str, *, unit: str = "mm") -> trimesh.Trimesh:
     """Read a closed mesh in mm with faces wound outwards; raises as ``load_mesh_field``."""
-    try:
+    # trimesh's readers raise exceptions of any type
+    with ErrorsAs(Exception, lambda error: MeshError(f"{file}: not readable as a triangle mesh ({error}); give an STL, OBJ or PLY file")):
         mesh = trimesh.load(file, force="mesh", process=True)
-    except Exception as error:  # trimesh's readers raise exceptions of any type
-        raise MeshError(f"{file}: not readable as a triangle mesh ({error}); give an STL, OBJ or PLY file") from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise MeshError(f"{file}: no triangles in it; export a closed surface")
     mesh.apply_scale(_MM[unit])

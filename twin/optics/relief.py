@@ -19,7 +19,7 @@ from twin.optics.direct_light import DirectLight
 from twin.optics.lights import lights
 from twin.optics.measured import values_of
 from twin.optics.surfaces import cap_albedo
-from twin.types import BoolArray, FloatArray, IntArray, PinState
+from twin.types import FloatArray, IntArray, PinState
 
 POWER = 1.5
 """Power of a tile's levels (see ``ReliefSpec.tiles``)."""
@@ -114,7 +114,7 @@ class Relief:
         """Numbers (n,) of pixels of the window, and the linear light (n, 3) that is added there."""
         relief = self._relief
         places = cap_places(self._spec.view, self._spec.pins, state, self._window_px, relief.reach)
-        used = _relief_mask(relief, places.place)
+        used = np.where(np.linalg.norm(places.place, axis=-1) > SKIN_FROM, relief.skin, relief.caps)
         places = CapPlaces(places.pixels[used], places.cap[used], places.place[used])
         weights = places.weights(relief.cells, relief.reach, self._spec.pins.count)
         return places.pixels, (weights @ self._values) * self._lamp(state)[places.cap].astype(np.float32)
@@ -129,11 +129,6 @@ class CapLamp:
 
     def __call__(self, state: PinState) -> FloatArray:
         return self._lamp(state.caps_mm, state.axis, self._bump) * self._albedo / np.pi
-
-
-def _relief_mask(relief: ReliefSpec, place: FloatArray) -> BoolArray:
-    skin = np.linalg.norm(place, axis=-1) > SKIN_FROM
-    return np.where(skin, relief.skin, relief.caps)
 
 
 def tiles_of(relief: ReliefSpec, count: int) -> FloatArray:

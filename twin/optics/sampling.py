@@ -32,7 +32,7 @@ def near_pins(
     x0, y0, x1, y1 = window_px
     across, back = across_axis(state.axis)
     middle = project(view, state.caps_mm)
-    reach_mm = 0.5 * pins.cap_diameter_mm * _largest_outline(appearance)
+    reach_mm = 0.5 * pins.cap_diameter_mm * float(1 + np.abs(np.array(appearance.cap_shapes or [[0.0]])).sum(axis=1).max())
     sides = [project(view, state.caps_mm + reach_mm * way) for way in (across, -back)]
     radius = np.max([np.linalg.norm(side - middle, axis=1) for side in sides], axis=0) + MARGIN_PX
     feet = project(view, state.base_mm)
@@ -42,12 +42,6 @@ def near_pins(
     for wide in np.unique(width):
         cv2.polylines(mask, list(fine[width == wide]), False, 1, int(wide), cv2.LINE_8, SUBPIXEL_BITS)  # the lines have round ends
     return mask.astype(bool)
-
-
-def _largest_outline(appearance: AppearanceSpec) -> float:
-    """Largest radius of the caps' outlines, relative to a circle."""
-    shapes = np.array(appearance.cap_shapes or [[0.0]])
-    return float(1 + np.abs(shapes).sum(axis=1).max())
 
 
 PASCAL_STEPS = ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF))

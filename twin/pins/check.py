@@ -24,7 +24,7 @@ from twin.pins.labelling.identify import score_layout
 from twin.pins.labelling.reference import Reference, nominal_reference, project_rest
 from twin.pins.labelling.view import MOST_STRETCH, view_of
 from twin.pins.pipeline import Pipeline
-from twin.progress import Step, unheard
+from twin.progress import Step, report_each, unheard
 from twin.types import Form, Frame, Observation
 
 LEAST_RIM = 0.5
@@ -135,12 +135,8 @@ def examine(frames: list[Frame], spec: SensorSpec, detector: DetectorSpec | None
     tuned = with_detector(spec, detector)
     pipeline = Pipeline(tuned, form)
     if known_sizes(tuned) != known_sizes(spec):  # tuned for another size: the calibrated pins are those of the view scaled to it
-        blob = blob_spec(tuned.pipeline, form).model_copy(update={"rest_px": ()})
-        spec = tuned.model_copy(update={"pipeline": tuned.pipeline.model_copy(update={str(form): blob})})
-    seen = []
-    for k, frame in enumerate(frames):
-        seen.append(pipeline(frame))
-        progress(k + 1, len(frames))
+        spec = tuned.alter(pipeline={str(form): blob_spec(tuned.pipeline, form).alter(rest_px=())})
+    seen = [pipeline(frame) for frame in report_each(frames, progress)]
     nominal = nominal_reference(spec, form)
     findings = [
         _layout(frames, spec, pipeline.blob_spec.polarity),

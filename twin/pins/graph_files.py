@@ -1,7 +1,7 @@
 """Graphs of a frame, of many frames or of found pins, and their files: arrays and pictures."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -86,37 +86,22 @@ def write_graphs_of(
     if legacy and (kind != "voronoi" or path.suffix == PINS):
         raise OptionError("`legacy` makes Voronoi graphs of frames; leave `kind` out and give frames")
     if path.suffix == PINS:
-        found, nodes_px = read_pins(path, sensor.pins.count)
-        names = list(found)
+        names, nodes_px = read_pins(path, sensor.pins.count)
         form = form or form_of_pins(sensor, nodes_px)
-        reference, image, left_out, notes = nominal_reference(sensor, form), None, [], []
+        reference, image = nominal_reference(sensor, form), np.zeros(frame_size(sensor, form)[::-1], np.uint8)
         graphs = [make_graph(kind, nodes, outmost=reference.outmost, net=reference.net) for nodes in nodes_px]
+        found = Graphs(list(names), graphs, [], [], [])
     else:
-        seen = _graphs_of_recording(path, sensor, kind, form, legacy=legacy)
-        names, graphs, left_out, notes = seen.names, seen.graphs, seen.left_out, seen.notes
-        form, reference, image = seen.form, seen.reference, seen.first_image
-    if legacy:
-        pictures = draw_bare_graph(out, graphs[0])
-    else:
-        pictures = draw_graph_pictures(out, sensor.name, frame_size(sensor, form), graphs[0], reference, image)
-    return Graphs(names, graphs, left_out, [write_graphs(out, names, graphs), *pictures], notes)
+        found, reference, image = _graphs_of_recording(path, sensor, kind, form, legacy=legacy)
+    first = found.graphs[0]
+    pictures = draw_bare_graph(out, first) if legacy else draw_graph_pictures(out, sensor.name, first, reference, image)
+    return replace(found, written=[write_graphs(out, found.names, found.graphs), *pictures])
 
 
-@dataclass(frozen=True)
-class _RecordingGraphs:
-    """Graphs of the valid frames of a recording, their reference, and the frames that were left out with the reasons."""
-
-    names: list[str]
-    graphs: list[PinGraph]
-    form: Form
-    reference: Reference
-    first_image: np.ndarray
-    left_out: list[str]
-    notes: list[str]
-
-
-def _graphs_of_recording(path: Path, spec: SensorSpec, kind: GraphKind, form: Form | None, *, legacy: bool = False) -> _RecordingGraphs:
-    """The graphs of a recording, by the pipeline or by the method of the published release.
+def _graphs_of_recording(
+    path: Path, spec: SensorSpec, kind: GraphKind, form: Form | None, *, legacy: bool = False
+) -> tuple[Graphs, Reference, np.ndarray]:
+    """The graphs of a recording by the pipeline or by the method of the published release, their reference, and the first picture.
 
     Raises
     ------
@@ -145,7 +130,7 @@ def _graphs_of_recording(path: Path, spec: SensorSpec, kind: GraphKind, form: Fo
     left_out += [f"{bad['image_name']}: {bad['reason']}" for bad in recording.failed]
     if first_image is None:
         raise FrameError(f"{path}: no frame has a graph; the first: {left_out[0] if left_out else 'no frame in it'}")
-    return _RecordingGraphs(names, graphs, recording.form, reference, first_image, left_out, recording.problems + notes)
+    return Graphs(names, graphs, left_out, [], recording.problems + notes), reference, first_image
 
 
 def read_pins(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -232,15 +217,11 @@ def write_graphs(out: Path, names: Sequence[str], graphs: Sequence[PinGraph]) ->
     return write_npz(out / "graph.npz", arrays, compressed=True)
 
 
-def draw_graph_pictures(
-    out: Path, title: str, size_px: tuple[int, int], graph: PinGraph, reference: Reference, image: np.ndarray | None
-) -> list[Path]:
+def draw_graph_pictures(out: Path, title: str, graph: PinGraph, reference: Reference, image: np.ndarray) -> list[Path]:
     """Draw ``graph.png``, and for a Voronoi graph ``surface.png``, which compares it with the reference. Returns the files.
 
-    The graph is drawn over the frame (H, W[, 3]). Without a frame it is drawn on black of ``size_px`` (width, height).
+    The graph is drawn over the frame (H, W[, 3]).
     """
-    if image is None:
-        image = np.zeros(size_px[::-1], np.uint8)
     figure, (ax,) = new_figure(1, panel_inch=PICTURE_INCH)
     draw_frame(ax, image, f"{title}: {graph.kind}, {len(graph.nodes_px)} nodes, {len(graph.edges)} directed edges")
     draw_graph(ax, graph)

@@ -7,7 +7,7 @@ import json
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -228,6 +228,16 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise RecordError(f"{path}: damaged, holds no keys and values; {AGAIN}")
     return found
+
+
+@contextmanager
+def reading_tables(path: Path) -> Iterator[Any]:
+    """Context that gives the library of Parquet tables. If the tables turn out to be damaged, ``RecordError`` is raised."""
+    damaged = (OSError, KeyError, ValueError, TypeError, AttributeError, StopIteration, FrameError, library("pyarrow").ArrowException)
+    try:
+        yield library("pyarrow.parquet")
+    except damaged as error:
+        raise RecordError(f"{path}: damaged ({error}); {AGAIN}") from error
 
 
 def read_facts(path: Path) -> list[dict[str, Any]]:

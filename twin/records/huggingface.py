@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from twin.errors import FrameError, library
+from twin.errors import library
 from twin.frames.images import read_image, write_image
 from twin.frames.tables import base_name
-from twin.records.folder import AGAIN, PicturesWriter, read_facts, records_in, require_numbered
-from twin.records.record import CHANNELS, TIME, About, Episode, RecordError, Records, RecordStep
+from twin.records.folder import PicturesWriter, read_facts, reading_tables, records_in, require_numbered
+from twin.records.record import CHANNELS, TIME, About, Episode, Records, RecordStep
 from twin.store import remove_parts, replace_folder, write_json, write_text, write_with
 from twin.store.atomic import PART
 
@@ -103,16 +103,11 @@ def huggingface_records(folder: Path) -> Records:
 
 
 def _steps_of(folder: Path, about: About, index: int) -> Iterator[RecordStep]:
-    try:
-        for line in (
-            library("pyarrow.parquet").read_table(folder / METADATA, partitioning=None, page_checksum_verification=True).to_pylist()
-        ):
-            if line["episode_index"] != index:
-                continue
-            values = {name: np.array(line[CHANNELS[name].column], np.float32).reshape(about.shape(name)) for name in about.numbers}
-            yield RecordStep(read_image(folder / base_name(line["file_name"]))[0], float(line[TIME]), values)
-    except (OSError, KeyError, ValueError, TypeError, AttributeError, FrameError, library("pyarrow").ArrowException) as error:
-        raise RecordError(f"{folder}: damaged ({error}); {AGAIN}") from error
+    with reading_tables(folder) as parquet:
+        for line in parquet.read_table(folder / METADATA, partitioning=None, page_checksum_verification=True).to_pylist():
+            if line["episode_index"] == index:
+                values = {name: np.array(line[CHANNELS[name].column], np.float32).reshape(about.shape(name)) for name in about.numbers}
+                yield RecordStep(read_image(folder / base_name(line["file_name"]))[0], float(line[TIME]), values)
 
 
 def _facts_in(folder: Path) -> list[tuple[str, dict[str, Any]]]:

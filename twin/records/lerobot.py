@@ -22,7 +22,7 @@ from twin.errors import ErrorsAs, FrameError, library
 from twin.frames import open_recording
 from twin.frames.lerobot import COUNTERS
 from twin.frames.videos import describe_pauses
-from twin.records.folder import AGAIN, FolderWriter, image_of, png, read_json, read_sidecar, records_in
+from twin.records.folder import AGAIN, FolderWriter, image_of, png, read_json, read_sidecar, reading_tables, records_in
 from twin.records.record import CHANNELS, IMAGE, TIME, About, Episode, RecordError, Records, RecordStep, off_s
 from twin.store import write_json, write_text, write_with
 from twin.types import Form
@@ -47,6 +47,7 @@ PIXEL_STEP = 4
 """Step between the pixels, in each direction, from which the statistics of pictures are computed."""
 QUANTILES = {"q01": 1.0, "q10": 10.0, "q50": 50.0, "q90": 90.0, "q99": 99.0}
 """Names and percentages of the quantiles in LeRobot's statistics."""
+Stats = dict[str, dict[str, np.ndarray]]
 FOURCC = "mp4v"
 """Codec of videos that every build of OpenCV has (MPEG-4 part 2)."""
 
@@ -74,7 +75,7 @@ class LeRobotWriter(FolderWriter):
         self._file = self._frames = 0  # number of the next file, and number of frames so far
         self._tasks: list[str] = []
         self._off: list[tuple[float, str, str]] = []  # largest error of a time (s), key and pauses of an episode
-        self._stats: dict[str, dict[str, np.ndarray]] = {}
+        self._stats: Stats = {}
 
     def _metadata(self) -> dict[str, Any]:
         return super()._metadata() | {"video": self.video}
@@ -86,7 +87,8 @@ class LeRobotWriter(FolderWriter):
         self.video = bool(read_sidecar(self.folder)[1].get("video", False))
         rows = _episode_rows(self.folder)
         if rows:
-            self._file, self._frames = 1 + _file_number(rows[-1], "data"), int(rows[-1]["dataset_to_index"])
+            chunk, file = (int(rows[-1][f"data/{key}"]) for key in ("chunk_index", "file_index"))
+            self._file, self._frames = 1 + chunk * CHUNK_FILES + file, int(rows[-1]["dataset_to_index"])
             self._tasks = _tasks(self.folder)
             stats = read_json(self.folder / STATS)
             self._stats = {key: {k: np.asarray(v, float) for k, v in each.items()} for key, each in stats.items()}
@@ -100,11 +102,11 @@ class LeRobotWriter(FolderWriter):
     def _groups(self, episodes: Iterator[Episode]) -> Iterator[list[dict[str, Any]]]:
         while (first := next(episodes, None)) is not None:
             if group := self._write_group(chain([first], episodes)):
-                yield [facts for _, facts, _ in group]
+                yield group
 
-    def _write_group(self, waiting: Iterator[Episode]) -> list[tuple[dict[str, Any], dict[str, Any], dict[str, dict[str, np.ndarray]]]]:
-        """Write a file of episodes, then the data set's description. Returns row, facts and statistics of each episode."""
-        group: list[tuple[dict[str, Any], dict[str, Any], dict[str, dict[str, np.ndarray]]]] = []
+    def _write_group(self, waiting: Iterator[Episode]) -> list[dict[str, Any]]:
+        """Write a file of episodes, then the data set's description. Returns the facts of each episode."""
+        group: list[tuple[dict[str, Any], dict[str, Any], Stats]] = []  # row, facts and statistics of each episode
         at = {"chunk_index": self._file // CHUNK_FILES, "file_index": self._file % CHUNK_FILES}
         path = _make_folder(self.folder / DATA_PATH.format(**at))
         with tempfile.TemporaryDirectory(prefix="twin-video-") as aside:
@@ -123,18 +125,20 @@ class LeRobotWriter(FolderWriter):
         self._write_meta(group, at, stats)
         self._stats, self._file = stats, self._file + 1
         self._frames += sum(row["length"] for row, _, _ in group)
-        return group
+        return [facts for _, facts, _ in group]
 
     def _fill(self, file: BinaryIO, *, waiting: Iterator[Episode], group: list, at: dict[str, int], video: Path) -> None:
         """Write episodes into an open data file until it is large enough."""
         parquet, pa = library("pyarrow.parquet"), library("pyarrow")
-        schema = pa.schema(self._schema(pa), metadata={"huggingface": json.dumps({"info": {"features": self._hf_features()}})})
+        schema = self._schema(pa)
         frames, written = self._frames, 0
         film = _open_film(video, self.rate_hz, self.about.size_px) if self.video else None
         with parquet.ParquetWriter(file, schema, compression="snappy", write_page_checksum=True) as table:
             for episode in waiting:
                 number, rows, length = len(self.facts) + len(group), [], 0
-                task = self._task(episode.task)
+                if episode.task not in self._tasks:
+                    self._tasks.append(episode.task)
+                task = self._tasks.index(episode.task)
                 gathered = _Gathered(self.about)
                 for step in episode.steps():
                     self._require_fitting(episode, step)
@@ -176,11 +180,6 @@ class LeRobotWriter(FolderWriter):
         if most_s > 0.5 / self.rate_hz:
             self._off.append((most_s, key, describe_pauses(times_s)))
 
-    def _task(self, text: str) -> int:
-        if text not in self._tasks:
-            self._tasks.append(text)
-        return self._tasks.index(text)
-
     def _row(self, step: RecordStep, number: int, episode: int, index: int, task: int) -> dict[str, Any]:
         row: dict[str, Any] = {} if self.video else {IMAGE: {"bytes": png(_colour(step.image)), "path": f"frame-{number:06d}.png"}}
         for name, count in self.about.numbers.items():  # a single number is no list
@@ -189,15 +188,26 @@ class LeRobotWriter(FolderWriter):
         counted = dict(zip(COUNTERS, (number, episode, index, task), strict=True))
         return row | {TIME: float(step.time_s), "timestamp": number / self.rate_hz} | counted
 
-    def _schema(self, pa: Any) -> list[tuple[str, Any]]:
-        """Columns of the data files and their Arrow types."""
-        picture = [] if self.video else [(IMAGE, pa.struct([("bytes", pa.binary()), ("path", pa.string())]))]
-        kinds = {
-            name: pa.list_(pa.list_(pa.float32())) if len(self.about.shape(name)) == 2 else pa.list_(pa.float32(), count)
-            for name, count in self.about.numbers.items()
-        }
-        named = [(CHANNELS[name].column, kind if self.about.numbers[name] > 1 else pa.float32()) for name, kind in kinds.items()]
-        return [*picture, *named, (TIME, pa.float64()), ("timestamp", pa.float32()), *((name, pa.int64()) for name in COUNTERS)]
+    def _schema(self, pa: Any) -> Any:
+        """Columns of the data files: their Arrow types, and in the metadata their description for Hugging Face's library."""
+        columns: list[tuple[str, Any]] = []
+        described: dict[str, Any] = {}
+        said: dict[str, Any]
+        for name, feature in self._features().items():
+            dtype, shape = feature["dtype"], feature["shape"]
+            if dtype == "video":
+                continue
+            if dtype == "image":
+                kind, said = pa.struct([("bytes", pa.binary()), ("path", pa.string())]), {"_type": "Image"}
+            else:
+                kind, said = getattr(pa, dtype)(), {"dtype": dtype, "_type": "Value"}
+                if len(shape) == 2:
+                    kind, said = pa.list_(pa.list_(kind)), {"shape": shape, "dtype": dtype, "_type": "Array2D"}
+                elif shape != [1]:
+                    kind, said = pa.list_(kind, shape[0]), {"feature": said, "length": shape[0], "_type": "Sequence"}
+            columns.append((name, kind))
+            described[name] = said
+        return pa.schema(columns, metadata={"huggingface": json.dumps({"info": {"features": described}})})
 
     def _features(self) -> dict[str, dict[str, Any]]:
         """LeRobot's description of the columns."""
@@ -213,20 +223,6 @@ class LeRobotWriter(FolderWriter):
         features[TIME] = {"dtype": "float64", "shape": [1], "names": None}
         features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
         return features | {name: {"dtype": "int64", "shape": [1], "names": None} for name in COUNTERS}
-
-    def _hf_features(self) -> dict[str, Any]:
-        """Description of the columns for Hugging Face's library, which a file's own metadata hold."""
-        found: dict[str, Any] = {}
-        for name, feature in self._features().items():
-            value = {"dtype": feature["dtype"], "_type": "Value"}
-            if feature["dtype"] == "image":
-                found[name] = {"_type": "Image"}
-            elif feature["dtype"] != "video":
-                shape = feature["shape"]
-                several = {"feature": value, "length": shape[0], "_type": "Sequence"}
-                flat = {"shape": shape, "dtype": feature["dtype"], "_type": "Array2D"}
-                found[name] = value if shape == [1] else several if len(shape) == 1 else flat
-        return found
 
     def _episode_row(self, episode: Episode, number: int, start: int, length: int, at: dict[str, int]) -> dict[str, Any]:
         row = {
@@ -244,7 +240,7 @@ class LeRobotWriter(FolderWriter):
             row |= {f"videos/{IMAGE}/{end}_timestamp": time_s for end, time_s in ends_s.items()}
         return row
 
-    def _write_meta(self, group: list, at: dict[str, int], stats: dict[str, dict[str, np.ndarray]]) -> None:
+    def _write_meta(self, group: list, at: dict[str, int], stats: Stats) -> None:
         """Write the data set's description. The number of episodes comes last."""
         parquet, pa = library("pyarrow.parquet"), library("pyarrow")
         index = {"name": None, "field_name": "__index_level_0__", "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
@@ -302,7 +298,7 @@ class _Gathered:
         if len(self._pictures) > 2 * SAMPLED:
             self._pictures, self._every = self._pictures[::2], 2 * self._every
 
-    def stats(self, rate_hz: int, number: int, start: int, task: int) -> dict[str, dict[str, np.ndarray]]:
+    def stats(self, rate_hz: int, number: int, start: int, task: int) -> Stats:
         """Statistics of each column, in LeRobot's shapes: (3, 1, 1) for pictures, with values from 0 to 1, and (2,) for pins."""
         length = len(self.times_s)
         pixels = np.stack(self._pictures).reshape(-1, 3) / 255.0
@@ -332,7 +328,7 @@ def _deviations(rows: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-def _together(a: dict[str, dict[str, np.ndarray]], b: dict[str, dict[str, np.ndarray]]) -> dict[str, dict[str, np.ndarray]]:
+def _together(a: Stats, b: Stats) -> Stats:
     """Statistics of the union of two sets of rows. As in LeRobot, quantiles are averaged with the numbers of rows as weights."""
     found = {}
     for key, new in b.items():
@@ -376,12 +372,10 @@ def lerobot_records(folder: Path) -> Records:
 
 
 def _steps_of(folder: Path, row: dict[str, Any], about: About) -> Iterator[RecordStep]:
-    parquet = library("pyarrow.parquet")
-    at = {key: row[f"data/{key}"] for key in ("chunk_index", "file_index")}
-    path, number = folder / DATA_PATH.format(**at), row["episode_index"]
+    path, number = folder / DATA_PATH.format(**{key: row[f"data/{key}"] for key in ("chunk_index", "file_index")}), row["episode_index"]
     video = f"videos/{IMAGE}/from_timestamp" in row
     pictures = _film_pictures(folder, row, about) if video else iter(())
-    try:
+    with reading_tables(path) as parquet:
         file = parquet.ParquetFile(path, page_checksum_verification=True)
         leaf = next(k for k in range(len(file.schema)) if file.schema.column(k).path == "episode_index")
         for group in range(file.num_row_groups):
@@ -389,13 +383,10 @@ def _steps_of(folder: Path, row: dict[str, Any], about: About) -> Iterator[Recor
             if statistics is not None and statistics.has_min_max and not statistics.min <= number <= statistics.max:
                 continue
             for line in file.read_row_group(group).to_pylist():
-                if line["episode_index"] != number:
-                    continue
-                image = next(pictures) if video else image_of(line[IMAGE]["bytes"], about.gray, str(path))
-                values = {name: np.asarray(line[CHANNELS[name].column], np.float32).reshape(about.shape(name)) for name in about.numbers}
-                yield RecordStep(image, float(line[TIME]), values)
-    except (OSError, KeyError, ValueError, TypeError, StopIteration, library("pyarrow").ArrowException) as error:
-        raise RecordError(f"{path}: damaged ({error}); {AGAIN}") from error
+                if line["episode_index"] == number:
+                    image = next(pictures) if video else image_of(line[IMAGE]["bytes"], about.gray, str(path))
+                    found = {name: np.asarray(line[CHANNELS[name].column], np.float32) for name in about.numbers}
+                    yield RecordStep(image, float(line[TIME]), {name: value.reshape(about.shape(name)) for name, value in found.items()})
 
 
 def _film_pictures(folder: Path, row: dict[str, Any], about: About) -> Iterator[np.ndarray]:
@@ -415,14 +406,12 @@ def _episode_rows(folder: Path) -> list[dict[str, Any]]:
         if len(list(folder.glob("data/chunk-*/file-*.parquet"))) > 1:  # only the first file is there before it
             raise RecordError(f"{folder}: {INFO} is missing; {AGAIN}")
         return []
-    parquet, total = library("pyarrow.parquet"), read_json(folder / INFO).get("total_episodes")
+    total = read_json(folder / INFO).get("total_episodes")
     rows: list[dict[str, Any]] = []
-    try:
+    with reading_tables(folder / "meta/episodes") as parquet:
         for path in sorted(folder.glob("meta/episodes/chunk-*/file-*.parquet")):
             names = [name for name in parquet.read_schema(path).names if not name.startswith("stats/")]
             rows += parquet.read_table(path, columns=names, page_checksum_verification=True).to_pylist()
-    except (OSError, ValueError, KeyError, library("pyarrow").ArrowException) as error:
-        raise RecordError(f"{folder / 'meta/episodes'}: damaged ({error}); {AGAIN}") from error
     if not isinstance(total, int) or len(rows) < total:
         raise RecordError(f"{folder}: {INFO} states {total!r} episodes, the table has {len(rows)}; {AGAIN}")
     return rows[:total]
@@ -439,14 +428,8 @@ def _facts_of(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _tasks(folder: Path) -> list[str]:
-    try:
-        return [str(task) for task in library("pyarrow.parquet").read_table(folder / TASKS)["__index_level_0__"].to_pylist()]
-    except (OSError, KeyError, library("pyarrow").ArrowException) as error:
-        raise RecordError(f"{folder / TASKS}: damaged ({error}); {AGAIN}") from error
-
-
-def _file_number(row: dict[str, Any], what: str) -> int:
-    return int(row[f"{what}/chunk_index"]) * CHUNK_FILES + int(row[f"{what}/file_index"])
+    with reading_tables(folder / TASKS) as parquet:
+        return [str(task) for task in parquet.read_table(folder / TASKS)["__index_level_0__"].to_pylist()]
 
 
 def _colour(image: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from scenes import ExperimentSpec, SensorSpec, load_sensor
 from scenes.base import SpecError
 from scenes.files import read_regular
-from twin.errors import FrameError
+from twin.errors import ErrorsAs, FrameError
 from twin.frames import Recording, open_recording
 from twin.frames.folders import pictures_folder
 from twin.frames.images import write_image
@@ -176,11 +176,10 @@ def _read_pins(path: Path, recording: Recording) -> dict[str, np.ndarray]:
     """Pins that ``twin preprocess`` or a translation found, for the recording's frames; NaN for frames without pins."""
     if not (path / PINS).is_file():
         return {}
-    try:
-        with np.load(path / PINS, allow_pickle=False) as file:
-            names, pins_px = file["image_name"].tolist(), file["pins_px"].astype(np.float32)
-    except Exception as error:  # zipfile and numpy raise exceptions of any type for damaged files
-        raise FrameError(f"{path / PINS}: damaged; {AGAIN}") from error
+    # zipfile and numpy raise exceptions of any type for damaged files
+    damaged = ErrorsAs(Exception, lambda error: FrameError(f"{path / PINS}: damaged; {AGAIN}"))
+    with damaged, np.load(path / PINS, allow_pickle=False) as file:
+        names, pins_px = file["image_name"].tolist(), file["pins_px"].astype(np.float32)
     row_of = {name: row for row, name in enumerate(names)}
     rows = np.array([row_of.get(name, -1) for name in recording.names])
     return {"pins": np.where((rows >= 0)[:, None, None], pins_px[rows], np.float32(np.nan))}
@@ -265,14 +264,13 @@ class RecordingWriter(PicturesWriter):
             return []
         facts = read_facts(self.folder / EPISODES)
         length = sum(int(each["length"]) for each in facts)
-        try:
+        # zipfile and numpy raise exceptions of any type for damaged files
+        with ErrorsAs(Exception, lambda error: RecordError(f"{self.folder}: {TABLE} or {PINS} is damaged; {AGAIN}")):
             with (self.folder / TABLE).open(newline="", encoding="utf-8") as file:
                 self._rows = list(csv.reader(file))[1 : length + 1]
             if "pins" in self.about.numbers:
                 with np.load(self.folder / PINS, allow_pickle=False) as arrays:
                     self._pins = list(arrays["pins_px"][:length])
-        except Exception as error:  # zipfile and numpy raise exceptions of any type for damaged files
-            raise RecordError(f"{self.folder}: {TABLE} or {PINS} is damaged; {AGAIN}") from error
         return facts
 
     def _facts(self, episode: Episode, length: int) -> dict[str, Any]:

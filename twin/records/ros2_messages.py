@@ -30,6 +30,9 @@ _ENCAPSULATION: dict[bytes, Literal["<", ">"]] = {
 }  # the first two of the four bytes before a message: little or big endian
 
 
+_TEXT = "std_msgs/String"  # each text of an array is written as this message
+
+
 class Field(NamedTuple):
     """A field of a message: its name, the name of its type (a number's, ``string``, or a message's), and whether it is an array.
 
@@ -83,17 +86,20 @@ def _align(out: bytearray, size: int) -> None:
 def _write(out: bytearray, kind: str, message: Mapping[str, Any]) -> None:
     for name, base, length in fields_of(kind):
         value: Any = message.get(name)
-        if base == "string":
+        if text := base == "string" and length is None:
             value = (value or "").encode() + b"\0"
         elif length == 0 and value is None:
             value = ()
-        if length == 0 or base == "string":
+        if length == 0 or text:
             _align(out, 4)
             out += len(value).to_bytes(4, "little")
         if isinstance(value, bytes):
             out += value
         elif base in DEFINITIONS and length is None:
             _write(out, base, value or {})
+        elif base == "string":
+            for each in value:
+                _write(out, _TEXT, {"data": each})
         elif base in DEFINITIONS and not isinstance(value, np.ndarray):
             for each in value:
                 _write(out, base, each)
@@ -138,8 +144,9 @@ def _read(data: memoryview, at: int, kind: str, order: Literal["<", ">"]) -> tup
 
     message: dict[str, Any] = {}
     for name, base, length in fields_of(kind):
-        count = int(numbers(_DTYPES["uint32"], 1)[0]) if length == 0 or base == "string" else length
-        if base == "string":
+        text = base == "string" and length is None
+        count = int(numbers(_DTYPES["uint32"], 1)[0]) if length == 0 or text else length
+        if text:
             message[name], at = bytes(data[at : at + int(count or 1) - 1]).decode(), at + int(count or 0)
         elif base in _DTYPES:
             found = numbers(_DTYPES[base], 1 if count is None else count)
@@ -149,8 +156,8 @@ def _read(data: memoryview, at: int, kind: str, order: Literal["<", ">"]) -> tup
         else:
             message[name] = []
             for _ in range(count):
-                each, at = _read(data, at, base, order)
-                message[name].append(each)
+                each, at = _read(data, at, _TEXT if base == "string" else base, order)
+                message[name].append(each["data"] if base == "string" else each)
     return message, at
 
 
@@ -179,9 +186,24 @@ def wrench(force_n: np.ndarray, torque_nmm: np.ndarray) -> dict[str, Any]:
     return {"force": vector(force_n), "torque": vector(np.asarray(torque_nmm) / MM_PER_M)}
 
 
+def place(T_mm: np.ndarray) -> dict[str, Any]:
+    """A pose (4, 4) as message, in m."""
+    return {"position": vector(T_mm[:3, 3] / MM_PER_M), "orientation": vector(Rotation.from_matrix(T_mm[:3, :3]).as_quat())}
+
+
+def matrix_in(place: Mapping[str, Mapping[str, float]]) -> np.ndarray:
+    """The pose (4, 4), mm, of such a message; ``ValueError``: it is none."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat([place["orientation"][axis] for axis in "xyzw"]).as_matrix()
+    T[:3, 3] = [MM_PER_M * place["position"][axis] for axis in "xyz"]
+    if not np.isfinite(T).all():
+        raise ValueError("a pose that is not a number")
+    return T
+
+
 def transform(T_mm: np.ndarray, header: Mapping[str, Any], child: str) -> dict[str, Any]:
     """A pose (4, 4) of a frame as a ``/tf`` message, in m."""
-    parts = {"translation": vector(T_mm[:3, 3] / MM_PER_M), "rotation": vector(Rotation.from_matrix(T_mm[:3, :3]).as_quat())}
+    parts = dict(zip(("translation", "rotation"), place(T_mm).values(), strict=True))
     return {"transforms": [{"header": header, "child_frame_id": child, "transform": parts}]}
 
 

@@ -133,7 +133,7 @@ class Page:
         environment = Environment(
             loader=PackageLoader("twin.report", "."), undefined=StrictUndefined, autoescape=True, trim_blocks=True, lstrip_blocks=True
         )
-        environment.filters["names"] = lambda text: Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(text)))
+        environment.filters["names"] = lambda text: Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
         return environment.get_template("page.html.j2").render(
             stylesheet=stylesheet(),
             title=self.title,

@@ -193,7 +193,7 @@ def make_table(rows: Sequence[Row], columns: Sequence[Column | str], *, caption:
     heads, shown = [], []
     for entry in chosen:
         cells = [value if isinstance(value, Cell) else Cell(value) for value in (row.get(entry.key) for row in rows)]
-        values = [_scale_value(cell.value, entry.scale) for cell in cells]
+        values = [(float(cell.value) * entry.scale if entry.scale != 1 and is_number(cell.value) else cell.value) for cell in cells]
         numeric = entry.align == "right" or any(is_number(value) for value in values)
         texts = column(values, entry.digits, decimals=entry.decimals, signed=entry.signed)
         marked = _best(values, entry.best)
@@ -223,10 +223,6 @@ def _write_csv(path: Path, columns: list[str], rows: Sequence[Row]) -> Path:
 
 def _plain(value: object) -> str:
     return "" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def _scale_value(value: object, scale: float) -> object:
-    return float(value) * scale if scale != 1 and is_number(value) else value
 
 
 def _best(values: list[object], best: str) -> set[int]:

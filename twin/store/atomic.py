@@ -37,19 +37,14 @@ LOOK_S = 0.05
 """Interval, s, at which a run that waits for another one looks again."""
 
 _REMEDIES = {
-    errno.ENOSPC: "free some space and give the same command again",
-    errno.EDQUOT: "free some space and give the same command again",
-    errno.EROFS: "give a folder that may be written to",
-    errno.EACCES: "give a folder that may be written to",
-    errno.EPERM: "give a folder that may be written to",
-    errno.ENOENT: "make its folder first, or give another one",
-    errno.ENOTDIR: "give another folder: a file is in the way",
-    errno.EEXIST: "give another folder: a file is in the way",
-    errno.ENAMETOOLONG: "give a shorter name",
-    errno.EFBIG: "files can't be larger there; give another folder",
-    errno.EISDIR: "give another name: a folder is in the way",
+    "free some space and give the same command again": (errno.ENOSPC, errno.EDQUOT),
+    "give a folder that may be written to": (errno.EROFS, errno.EACCES, errno.EPERM),
+    "make its folder first, or give another one": (errno.ENOENT,),
+    "give another folder: a file is in the way": (errno.ENOTDIR, errno.EEXIST),
+    "give a shorter name": (errno.ENAMETOOLONG,),
+    "files can't be larger there; give another folder": (errno.EFBIG,),
+    "give another name: a folder is in the way": (errno.EISDIR,),
 }
-_ANY_REMEDY = "give another folder or free some space"
 
 
 def write_with(path: Path, fill: Callable[[BinaryIO], object]) -> Path:
@@ -114,9 +109,9 @@ def text_file(path: Path) -> Iterator[io.StringIO]:
     write_text(path, text.getvalue())
 
 
-def write_json(path: Path, content: object, *, default: Callable[[object], object] | None = None) -> Path:
-    """Write JSON with indented lines; ``default`` as in ``json.dumps``; raises as ``write_with``."""
-    return write_text(path, json.dumps(content, indent=1, default=default) + "\n")
+def write_json(path: Path, content: object) -> Path:
+    """Write JSON with indented lines; numbers of NumPy are written as numbers; raises as ``write_with``."""
+    return write_text(path, json.dumps(content, indent=1, default=np.generic.item) + "\n")
 
 
 def write_npz(path: Path, arrays: Mapping[str, np.ndarray], *, compressed: bool = False) -> Path:
@@ -154,7 +149,7 @@ def remove_parts(folder: Path) -> None:
 
 def unwritten(path: Path, error: OSError) -> StoreError:
     """The error for a path that can't be written. It names the path, the reason and the remedy."""
-    remedy = _REMEDIES.get(error.errno or 0, _ANY_REMEDY)
+    remedy = next((text for text, numbers in _REMEDIES.items() if error.errno in numbers), "give another folder or free some space")
     return StoreError(f"{path}: can't be written ({error.strerror or error}); {remedy}")
 
 

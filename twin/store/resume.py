@@ -96,15 +96,15 @@ def find_json(folder: Path, item: Item) -> Any:
         return None
 
 
-def keep_json(folder: Path, item: Item, content: object, *, default: Callable[[object], object] | None = None) -> Path:
-    """Store an item as JSON (``default`` as in ``json.dumps``), and return the file.
+def keep_json(folder: Path, item: Item, content: object) -> Path:
+    """Store an item as JSON, and return the file.
 
     Raises
     ------
     StoreError
         The file can't be written.
     """
-    return write_json(_ready(folder) / f"{item.file}.json", {_RECORD: item.made_by, _CONTENT: content}, default=default)
+    return write_json(_ready(folder) / f"{item.file}.json", {_RECORD: item.made_by, _CONTENT: content})
 
 
 def kept_json(folder: Path, item: Item, compute: Callable[[], Any]) -> Any:

@@ -15,10 +15,9 @@ from scenes import list_experiments, load_experiment
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
-from twin.camera.projection import project
+from twin.camera.projection import project_in_form
 from twin.errors import ContactError
 from twin.estimate import Estimate, SensorModel, pins_in
-from twin.frames.forms import from_raw
 from twin.geometry.solid import Resolution
 from twin.mechanics.follow import STEP_MM, Follower
 from twin.mechanics.law import ContactLaw
@@ -418,7 +417,7 @@ class MovingContact:
         of_frame = self.model is not None and self.model.form is self.setup.form
         seen = pins_in(frame, estimate if of_frame else None, self._pipeline)
         times = {"picture": now - started, "estimate": estimated - now, "pins": time.perf_counter() - estimated}
-        true_px = from_raw(self.setup.sensor.recording, self.setup.form, project(self.setup.sensor.view, state.caps_mm))
+        true_px = project_in_form(self.setup.sensor, self.setup.form, state.caps_mm)
         labels = self.labels(state.T_sensor_object if len(state.contact_mm) else T)
         self._last = ContactAnswer(
             self.setup, self._count, self._solved, ObjectPose.of(T, self._apex_mm), -self._follower.gap_mm(T), state, light, raw, frame,

@@ -135,9 +135,7 @@ class CnnModel(Model):
 
 
 # Settings of PoseNet (Lepora 2020).
-POSENET_RECIPE = Recipe(
-    epochs=100, batch=16, rate=1e-4, schedule="constant", patience=10, decay=0.0, average=0.0, loss="l2", scaling="unit", members=1
-)
+POSENET_RECIPE = Recipe(batch=16, rate=1e-4, schedule="constant", patience=10, decay=0.0, average=0.0, loss="l2", scaling="unit", members=1)
 CNN_V1 = CnnModel(
     name="cnn-v1",
     description="PoseNet: 5 convolutions of 256 filters",

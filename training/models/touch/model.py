@@ -88,14 +88,8 @@ class Bases:
     def __call__(self, moved: np.ndarray, light: np.ndarray) -> np.ndarray:
         """Features (M, D) of displacements (M, 2 N), rest spacings, and levels (M, N)."""
         moved, light = moved * np.repeat(self.seen, 2), light * self.seen
-        return np.concatenate(
-            [
-                (moved - self.moved_mean) @ self.moved,
-                (self.relative_of(moved) - self.relative_mean) @ self.relative,
-                (light - self.light_mean) @ self.light,
-            ],
-            axis=1,
-        )
+        relative = (self.relative_of(moved) - self.relative_mean) @ self.relative
+        return np.concatenate([(moved - self.moved_mean) @ self.moved, relative, (light - self.light_mean) @ self.light], axis=1)
 
     def relative_of(self, moved: np.ndarray) -> np.ndarray:
         """Displacements (M, 2 N) divided by their norm plus ``small``."""
@@ -111,10 +105,8 @@ class Bases:
         small = np.array([SMALL * np.sqrt(moved.shape[1])])
         relative = moved / (np.linalg.norm(moved, axis=1, keepdims=True) + small)
         means = [values.mean(axis=0) for values in (moved, relative, light)]
-        directions = [
-            _directions(values - mean, count)
-            for values, mean, count in zip((moved, relative, light), means, (modes, modes, light_modes), strict=True)
-        ]
+        kinds = zip((moved, relative, light), means, (modes, modes, light_modes), strict=True)
+        directions = [_directions(values - mean, count) for values, mean, count in kinds]
         return cls(means[0], directions[0], means[1], directions[1], means[2], directions[2], small, seen)
 
 

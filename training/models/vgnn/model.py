@@ -82,17 +82,9 @@ def fill_lost(
     return nodes_px, area_px2
 
 
-def seated_inputs(
-    registration: Registration,
-    nodes_px: np.ndarray,
-    area_px2: np.ndarray,
-    lost: np.ndarray,
-    reference: Reference,
-    *,
-    together: bool = False,
-) -> PinInputs:
-    """Inputs of frames (see ``fill_lost``) without the camera's displacement; ``together`` as in ``Registration``."""
-    nodes, area, _, share = registration(nodes_px, area_px2, together=together)
+def seat_inputs(registration: Registration, filled: tuple, lost: np.ndarray, reference: Reference, *, together: bool = False) -> PinInputs:
+    """Inputs of frames, ``filled`` as by ``fill_lost``, without the camera's displacement; ``together`` as in ``Registration``."""
+    nodes, area, _, share = registration(*filled, together=together)
     return PinInputs(pin_features(nodes, area, reference), lost, share)
 
 
@@ -163,9 +155,8 @@ class Vgnn(nn.Module):
     def prepare(self, x: torch.Tensor) -> None:
         """Set the scales of the features and the principal components from training features (M, N, F) of frames without lost pins."""
         self.scale.copy_(x.flatten(0, 1).std(dim=0).clamp(min=1e-6))
-        for flat, mean, components in zip(
-            self._modal(x), (self.mode_mean, self.area_mean), (self.components, self.area_components), strict=True
-        ):
+        learnt = (self.mode_mean, self.components), (self.area_mean, self.area_components)
+        for flat, (mean, components) in zip(self._modal(x), learnt, strict=True):
             if components.shape[1]:
                 mean.copy_(flat.mean(dim=0))
                 components.copy_(mode_components(flat - mean, components.shape[1]))
@@ -310,8 +301,8 @@ class VgnnModel(PinModel):
         In view 1 the whole difference of each frame from the expected camera is removed, as for a camera at another place.
         """
         registration, left = fit_registration(pins.nodes_px[train], pins.reference.pins_px)
-        nodes_px, area_px2 = fill_lost(registration, pins.nodes_px, pins.area_px2, pins.lost, pins.reference)
-        seated = seated_inputs(registration, nodes_px, area_px2, pins.lost, pins.reference)
+        nodes_px, area_px2 = filled = fill_lost(registration, pins.nodes_px, pins.area_px2, pins.lost, pins.reference)
+        seated = seat_inputs(registration, filled, pins.lost, pins.reference)
         taken = registration.difference(nodes_px)
         taken[train] = left
         displaced = pin_features(*registration.take_out(nodes_px, area_px2, taken), pins.reference)
@@ -323,10 +314,10 @@ class VgnnModel(PinModel):
         """See ``PinModel``. If a frame without contact shows the camera's place, no displacement of the camera is estimated."""
         registration = Registration(**learnt["registration"])
         pins = pins.relative_to(reference) if pins.measured else pins
-        nodes_px, area_px2 = fill_lost(registration, pins.nodes_px, pins.area_px2, pins.lost, reference)
+        filled = fill_lost(registration, pins.nodes_px, pins.area_px2, pins.lost, reference)
         if pins.measured:
-            return PinInputs(pin_features(nodes_px, area_px2, reference), pins.lost)
-        return seated_inputs(registration, nodes_px, area_px2, pins.lost, reference, together=together)
+            return PinInputs(pin_features(*filled, reference), pins.lost)
+        return seat_inputs(registration, filled, pins.lost, reference, together=together)
 
     def initialise(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor, numbers: torch.Tensor, code: LabelCode) -> None:
         """See ``Model``. Sets the scales of the features and the pin modes."""

@@ -98,17 +98,8 @@ class ObjectsPlan:
         return learnt + tests
 
     def _config(self, obj: ObjectSpec, experiment: ExperimentSpec, apart: int) -> GenerationConfig:
-        return GenerationConfig(
-            sensor=self.sensor,
-            object=obj,
-            experiment=experiment,
-            randomisation=self.randomisation,
-            friction=obj.friction,
-            seed=self.seed + apart,
-            images="none",
-            states="all",
-            across=self.across,
-        )
+        how: dict[str, Any] = {"randomisation": self.randomisation, "images": "none", "states": "all", "across": self.across}
+        return GenerationConfig(sensor=self.sensor, object=obj, experiment=experiment, friction=obj.friction, seed=self.seed + apart, **how)
 
     def trained_on(self, sets: dict[str, Dataset]) -> dict[str, Dataset]:
         """The data set that each model is trained on, by the model's name. Both have the same number of contacts."""

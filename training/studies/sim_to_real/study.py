@@ -17,30 +17,11 @@ from training.data.dataset import Dataset, join_datasets, load_dataset
 from training.data.targets import Targets
 from training.estimate.estimator import PoseEstimator
 from training.runs.assemble import intervals
+from training.studies.sim_to_real import steps
 from training.studies.sim_to_real.discrepancy import Discrepancy, Residuals, measure_residuals
 from training.studies.sim_to_real.model_inversion import TwinRead, named_labels, read_row, read_twin
 from training.studies.sim_to_real.page import write_page
 from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL, WITHOUT, SimToRealPlan
-from training.studies.sim_to_real.steps import (
-    StudyFrames,
-    Twin,
-    arm_labels,
-    as_mounted,
-    choose_frames,
-    combine_co_kriging,
-    designed_frames,
-    evaluate_run_row,
-    full_twin,
-    measured_of,
-    quadratic_row,
-    states_like,
-    states_touching,
-    train_in_twin,
-    train_on_real,
-    widen_intervals,
-    with_missing,
-    without_one_ingredient,
-)
 from twin.calibration.contact import fit_contact
 from twin.calibration.contact.simulate import CalibrationSetup
 from twin.estimate import readable_labels
@@ -89,7 +70,7 @@ def teach(
     told = named_labels(twin.estimate(moved[few], known, moved[unlabelled], moved[unlabelled]), real.targets.names)
     rows = np.sort(np.concatenate([few, unlabelled]))
     taught = replace(real, targets=_with_estimated(real.targets, few, unlabelled, told)).rows(rows)
-    train_on_real(taught, out, seed=seed, epochs=epochs, progress=progress)
+    steps.train_on_real(taught, out, seed=seed, epochs=epochs, progress=progress)
     judged, found = twin.left_out(moved[few], known)
     part = real.rows(few[judged])
     if not len(part):
@@ -100,7 +81,7 @@ def teach(
     _, scale = estimator.ensemble.destandardise(mean, scale)
     made = named_labels(found, part.targets.names)
     said = intervals(made, scale, part.targets.corrected, part.targets.raw, executed, part.targets.units)
-    widen_intervals(out, {key: np.maximum(getattr(estimator.ensemble, key), width) for key, width in said.items()})
+    steps.widen_intervals(out, {key: np.maximum(getattr(estimator.ensemble, key), width) for key, width in said.items()})
 
 
 def _with_estimated(targets: Targets, few: np.ndarray, unlabelled: np.ndarray, told: np.ndarray) -> Targets:
@@ -169,11 +150,11 @@ class Ground:
     setup: CalibrationSetup
     real: Dataset
     few: Dataset
-    chosen: StudyFrames
+    chosen: steps.StudyFrames
     measured: MeasuredFrames
     residuals: Residuals
-    full: Twin
-    twins: list[Twin]
+    full: steps.Twin
+    twins: list[steps.Twin]
 
 
 @writes("study.csv", "index.html", "errors*.png", "ingredients*.png", "calibration", "labelled")
@@ -200,16 +181,16 @@ def run(plan: SimToRealPlan, out: Path, *, progress: Progress = silent) -> SimTo
         labelled, copies = None if missing is None else ground.few, [each.pins for each in learnt[1:]]
         with stage(progress, twin.name) as step:
             every, seed = learnt[0].with_copies(copies), plan.seed
-            train_in_twin(every, folder, seed=seed, split=seed, epochs=plan.epochs, labelled=labelled, progress=step)
+            steps.train_in_twin(every, folder, seed=seed, split=seed, epochs=plan.epochs, labelled=labelled, progress=step)
         if twin is ground.full:
-            bare = states_touching(sets[twin.contacts], plan.target_object)
-            like = bare.rows(states_like(bare, ground.few))
-            beside = combine_co_kriging(folder, out / BESIDE, like, ground.few, seed=plan.seed)
-            widen_intervals(folder, beside.intervals)
+            bare = steps.states_touching(sets[twin.contacts], plan.target_object)
+            like = bare.rows(steps.states_like(bare, ground.few))
+            beside = steps.combine_co_kriging(folder, out / BESIDE, like, ground.few, seed=plan.seed)
+            steps.widen_intervals(folder, beside.intervals)
             full_learnt = learnt[0]
-        rows.append(evaluate_run_row(twin.says, 0, folder, ground.real, ground.chosen.test))
+        rows.append(steps.evaluate_run_row(twin.says, 0, folder, ground.real, ground.chosen.test))
         if twin is ground.full:
-            rows.append(evaluate_run_row(BOTH, plan.labels, out / BESIDE, ground.real, ground.chosen.test))
+            rows.append(steps.evaluate_run_row(BOTH, plan.labels, out / BESIDE, ground.real, ground.chosen.test))
     rows += _without_the_twin(ground)
     read = read_twin(sets[ground.full.contacts], plan.target_object, plan.experiment, seed=plan.seed)
     rows += _invert_model_rows(ground, read)
@@ -222,9 +203,9 @@ def _prepare(plan: SimToRealPlan, out: Path, progress: Progress) -> Ground:
     """Read and choose frames, fit the specification if the plan says so, and measure the residuals on the labelled frames."""
     with stage(progress, "frames") as step:
         real = load_dataset(plan.frames, plan.sensor, plan.experiment.targets, progress=step).in_order()
-    chosen = choose_frames(len(real), plan.labels, plan.seed)
+    chosen = steps.choose_frames(len(real), plan.labels, plan.seed)
     few = real.rows(chosen.few)
-    measured = measured_of(few)
+    measured = steps.measured_of(few)
     setup = CalibrationSetup(
         plan.sensor, plan.experiment, plan.target_object, measured.form, plan.across, out / "calibration", plan.workers
     )
@@ -236,17 +217,17 @@ def _prepare(plan: SimToRealPlan, out: Path, progress: Progress) -> Ground:
         residuals = measure_residuals(setup, measured, step)
     moves = load_randomisation("moves")
     sheared = any(label.move.any() for label in measured.labels)
-    full = full_twin(plan, setup.sensor, measured.labels, (residuals.friction_spread() or moves.friction) if sheared else None)
-    others = without_one_ingredient(full, as_mounted(plan.sensor), moves, load_randomisation("contact")) if plan.ablate else []
+    full = steps.full_twin(plan, setup.sensor, measured.labels, (residuals.friction_spread() or moves.friction) if sheared else None)
+    others = steps.without_one_ingredient(full, steps.as_mounted(plan.sensor), moves, load_randomisation("contact")) if plan.ablate else []
     return Ground(plan, out, progress, setup, real, few, chosen, measured, residuals, full, [full, *others])
 
 
-def _residual_key(twin: Twin) -> tuple[int, tuple[float, ...]]:
+def _residual_key(twin: steps.Twin) -> tuple[int, tuple[float, ...]]:
     """Everything that the residuals of a twin depend on within one study."""
     return twin.across, twin.frictions
 
 
-def _missing(ground: Ground, twin: Twin, known: dict[tuple[int, tuple[float, ...]], Discrepancy]) -> Discrepancy | None:
+def _missing(ground: Ground, twin: steps.Twin, known: dict[tuple[int, tuple[float, ...]], Discrepancy]) -> Discrepancy | None:
     """The discrepancy of a twin that uses one, else None. ``known`` stores it for other twins with the same residuals."""
     if not twin.learns:
         return None
@@ -257,24 +238,24 @@ def _missing(ground: Ground, twin: Twin, known: dict[tuple[int, tuple[float, ...
     return known[_residual_key(twin)]
 
 
-def _training_sets(ground: Ground, twin: Twin, sets: list[Dataset], missing: Discrepancy | None) -> list[Dataset]:
+def _training_sets(ground: Ground, twin: steps.Twin, sets: list[Dataset], missing: Discrepancy | None) -> list[Dataset]:
     """The data sets to train on: the states once for each draw of the discrepancy, or once unchanged if there is none."""
     if missing is None:
         return [twin.part(join_datasets(sets))]
-    labels, drawn = [arm_labels(each) for each in sets], []
+    labels, drawn = [steps.arm_labels(each) for each in sets], []
     for k in range(ground.plan.draws):
         seed = ground.plan.seed + SEEDS_APART * k
         with stage(ground.progress, f"{twin.name}: draw {k + 1}") as step:
             pairs = zip(sets, labels, strict=True)
-            drawn.append(join_datasets([with_missing(each, told, missing, seed, progress=step) for each, told in pairs]))
+            drawn.append(join_datasets([steps.with_missing(each, told, missing, seed, progress=step) for each, told in pairs]))
     return [twin.part(each) for each in drawn]
 
 
 def _invert_model_rows(ground: Ground, twin: TwinRead) -> list[dict[str, Any]]:
     """Rows of the table for model inversion, with growing numbers of labelled frames."""
-    labels, test = arm_labels(ground.real), ground.chosen.test
+    labels, test = steps.arm_labels(ground.real), ground.chosen.test
     rows = [read_row(BOTH, twin, ground.real, labels, rows, test) for rows in (np.zeros(0, int), *ground.chosen.nested)]
-    designed = designed_frames(ground.real, ground.chosen, ground.plan.seed)
+    designed = steps.designed_frames(ground.real, ground.chosen, ground.plan.seed)
     return rows + [read_row(f"{BOTH}{EVENLY}", twin, ground.real, labels, rows, test) for rows in designed]
 
 
@@ -284,8 +265,8 @@ def _train_on_labelled(ground: Ground, twin: TwinRead) -> dict[str, Any]:
     plan, real, few = ground.plan, ground.real, ground.chosen.few
     others = np.setdiff1d(ground.chosen.trained["all"], few)
     with stage(ground.progress, TAUGHT) as step:
-        teach(twin, real, arm_labels(real), few, others, ground.out / TAUGHT, seed=plan.seed, epochs=plan.epochs, progress=step)
-    return evaluate_run_row(BOTH + WITHOUT.format(count=len(others)), len(few), ground.out / TAUGHT, real, ground.chosen.test)
+        teach(twin, real, steps.arm_labels(real), few, others, ground.out / TAUGHT, seed=plan.seed, epochs=plan.epochs, progress=step)
+    return steps.evaluate_run_row(BOTH + WITHOUT.format(count=len(others)), len(few), ground.out / TAUGHT, real, ground.chosen.test)
 
 
 def _without_the_twin(ground: Ground) -> list[dict[str, Any]]:
@@ -294,11 +275,11 @@ def _without_the_twin(ground: Ground) -> list[dict[str, Any]]:
     for name, index in ground.chosen.trained.items():
         folder = ground.out / f"real_{name}"
         with stage(ground.progress, folder.name) as step:
-            train_on_real(ground.real.rows(index), folder, seed=ground.plan.seed, epochs=ground.plan.epochs, progress=step)
-        rows.append(evaluate_run_row(REAL, len(index), folder, ground.real, ground.chosen.test))
-        rows.append(quadratic_row(REAL, ground.real, index, ground.chosen.test))
+            steps.train_on_real(ground.real.rows(index), folder, seed=ground.plan.seed, epochs=ground.plan.epochs, progress=step)
+        rows.append(steps.evaluate_run_row(REAL, len(index), folder, ground.real, ground.chosen.test))
+        rows.append(steps.quadratic_row(REAL, ground.real, index, ground.chosen.test))
     counts = {len(index) for index in ground.chosen.trained.values()}
     others = [index for index in ground.chosen.nested if len(index) not in counts]
-    rows += [quadratic_row(REAL, ground.real, index, ground.chosen.test) for index in others]
-    designed = designed_frames(ground.real, ground.chosen, ground.plan.seed)
-    return rows + [quadratic_row(f"{REAL}{EVENLY}", ground.real, index, ground.chosen.test) for index in designed]
+    rows += [steps.quadratic_row(REAL, ground.real, index, ground.chosen.test) for index in others]
+    designed = steps.designed_frames(ground.real, ground.chosen, ground.plan.seed)
+    return rows + [steps.quadratic_row(f"{REAL}{EVENLY}", ground.real, index, ground.chosen.test) for index in designed]

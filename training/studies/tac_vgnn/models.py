@@ -105,30 +105,19 @@ def train_all(
 def table_row(plan: PlannedRun, data: Dataset, out: Path, minutes: float | None) -> dict[str, Any]:
     """One run's row of the table, with its errors on the rows kept out of training. If it was not begun, the row states only that."""
     folder = out / plan.folder
-    row: dict[str, Any] = {
-        "model": plan.name,
-        "seed": plan.config.seed,
-        "labels": plan.config.labels,
-        "minutes_now": minutes,
-        "state": "not begun",
-    }
+    row: dict[str, Any] = {"model": plan.name, "seed": plan.config.seed, "labels": plan.config.labels}
+    row |= {"minutes_now": minutes, "state": "not begun"}
     if not (folder / TENSORS).is_file():
         return row
     estimator = PoseEstimator.load(folder)
     rows = rows_to_evaluate(estimator, data, "validation")
     metrics = measure_errors(estimator.predict_rows(data, rows), data, rows)
     curves = read_curves(folder)
-    row |= {
-        "state": "ended early" if (folder / CHECKPOINT).exists() else "finished",
-        "parameters": read_config(folder)["parameters"],
-        "epochs": len(curves),
-        "epochs_allowed": plan.config.recipe.epochs * plan.config.recipe.members,
-        "training_minutes": sum(point["seconds"] for point in curves) / 60,
-        "s_per_epoch": float(np.median([point["seconds"] for point in curves])),
-        "frames": metrics["frames"],
-        "without_prediction": metrics["without_prediction"],
-        "leak_slope": metrics["leak_slope"],
-    }
+    seconds = [point["seconds"] for point in curves]
+    row |= {"state": "ended early" if (folder / CHECKPOINT).exists() else "finished", "parameters": read_config(folder)["parameters"]}
+    row |= {"epochs": len(curves), "epochs_allowed": plan.config.recipe.epochs * plan.config.recipe.members}
+    row |= {"training_minutes": sum(seconds) / 60, "s_per_epoch": float(np.median(seconds))}
+    row |= {key: metrics[key] for key in ("frames", "without_prediction", "leak_slope")}
     for kind in ("raw", "corrected"):
         for name in data.targets.names:
             row[f"{name}_{kind}"] = metrics[kind][name]["mae"]
@@ -224,12 +213,6 @@ def measure_training(model: str, pins: PinTable, inputs: Inputs, batch: int, *, 
     with PeakMemory(device) as memory:
         loop.epoch()
         seconds = loop.epoch()["seconds"]
-    return {
-        "model": model,
-        "parameters": parameter_count(network),
-        "batch": batch,
-        "rows_timed": timed,
-        "ms_per_frame": 1e3 * seconds / timed * count / len(pins),
-        "s_per_epoch": seconds if timed == count else None,
-        "memory_mib": memory.peak,
-    }
+    row: dict[str, Any] = {"model": model, "parameters": parameter_count(network), "batch": batch, "rows_timed": timed}
+    row |= {"ms_per_frame": 1e3 * seconds / timed * count / len(pins), "s_per_epoch": seconds if timed == count else None}
+    return row | {"memory_mib": memory.peak}

@@ -88,19 +88,10 @@ def compare_graphs(pins: PinTable) -> list[dict[str, Any]]:
             taken.append(1e3 * (perf_counter() - started))
             edges.append(len(graph.edges))
         paper_edges, paper_s = PAPER.get((len(rest), kind), (None, None))
-        rows.append(
-            {
-                "graph": kind,
-                "nodes": len(rest),
-                "features": 3 if kind == "voronoi" else 2,
-                "edges_no_contact": len(make_graph(kind, rest, outmost=outmost).edges),
-                "edges_least": min(edges),
-                "edges_most": max(edges),
-                "ms": float(np.median(taken)),
-                "paper_edges": paper_edges,
-                "paper_ms": None if paper_s is None else 1e3 * paper_s,
-            }
-        )
+        row: dict[str, Any] = {"graph": kind, "nodes": len(rest), "features": 3 if kind == "voronoi" else 2}
+        row |= {"edges_no_contact": len(make_graph(kind, rest, outmost=outmost).edges)}
+        row |= {"edges_least": min(edges), "edges_most": max(edges), "ms": float(np.median(taken))}
+        rows.append(row | {"paper_edges": paper_edges, "paper_ms": None if paper_s is None else 1e3 * paper_s})
     return rows
 
 
@@ -133,15 +124,9 @@ class AreaChange:
         grown = np.maximum(change, 0)
         place = self.graph.nodes_px - self.graph.nodes_px.mean(axis=0)
         where = grown @ place / max(grown.sum(), 1e-9)
-        return {
-            "contact": self.name,
-            "depth_mm": self.depth_mm,
-            "source": self.source,
-            "largest_growth_percent": float(np.percentile(change, 99)),
-            "mean_size_of_change_percent": float(np.abs(change).mean()),
-            "growth_x_px": float(where[0]),
-            "growth_y_px": float(where[1]),
-        }
+        row: dict[str, Any] = {"contact": self.name, "depth_mm": self.depth_mm, "source": self.source}
+        row |= {"largest_growth_percent": float(np.percentile(change, 99)), "mean_size_of_change_percent": float(np.abs(change).mean())}
+        return row | {"growth_x_px": float(where[0]), "growth_y_px": float(where[1])}
 
 
 def twin_contacts(spec: SensorSpec, form: Form, *, progress: Step | None = None) -> list[AreaChange]:
@@ -266,11 +251,8 @@ class TacVgnnPlan:
 
     def runs(self) -> list[PlannedRun]:
         """Every run of the study."""
-        return [
-            plan_run(name, labels=self.labels, seed=seed, split=self.split, epochs=self.epochs)
-            for seed in self.seeds
-            for name in self.models
-        ]
+        settings: dict[str, Any] = {"labels": self.labels, "split": self.split, "epochs": self.epochs}
+        return [plan_run(name, seed=seed, **settings) for seed in self.seeds for name in self.models]
 
 
 @dataclass(frozen=True, repr=False)
@@ -331,11 +313,8 @@ def run(plan: TacVgnnPlan, out: Path, *, progress: Progress = silent) -> TacVgnn
     graphs = compare_graphs(data.pins)
     spent = train_all(runs, data, folder, max_minutes=plan.max_minutes, device=device, progress=progress)
     rows = [table_row(each, data, folder, spent.get(each.folder)) for each in runs]
-    written = [
-        write_table(out / "models.csv", rows),
-        write_table(out / "graphs.csv", graphs),
-        write_chart(out / "curves.png", lambda: curves_figure(runs, folder)),
-    ]
+    written = [write_table(out / "models.csv", rows), write_table(out / "graphs.csv", graphs)]
+    written.append(write_chart(out / "curves.png", lambda: curves_figure(runs, folder)))
     efficiency = _efficiency(plan, runs, data, device, progress)
     if efficiency:
         chart = write_chart(out / "efficiency.png", lambda: efficiency_figure(efficiency))

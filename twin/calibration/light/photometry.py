@@ -66,22 +66,6 @@ class Samples:
     caps: np.ndarray
 
 
-@dataclass(frozen=True)
-class PhotometryFit:
-    """A fitted specification.
-
-    Attributes
-    ----------
-    spec : SensorSpec
-    caps_rms, skin_rms : (first, last)
-        Rms residual of caps and of bare skin at the first and at the last step, gray levels.
-    """
-
-    spec: SensorSpec
-    caps_rms: tuple[float, float]
-    skin_rms: tuple[float, float]
-
-
 def sample_frame(
     frame: Aligned, around: tuple[np.ndarray, np.ndarray], response: ResponseSpec, gel: GelSpec, blob: BlobSpec, rng: np.random.Generator
 ) -> Samples:
@@ -119,7 +103,7 @@ def sample_frame(
     return Samples(pixels, mean[at], veil[at], np.arange(len(pixels)) < len(caps))
 
 
-def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress: Step) -> PhotometryFit:
+def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress: Step) -> SensorSpec:
     """Fit LED powers, colours of caps and skin, and the gel's haze.
 
     Parameters
@@ -150,7 +134,6 @@ def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress: Step) -> P
     layout = _Layout(models[0].led_count, levels.shape[1])
     x = layout.start(models, to_light(levels[caps & useful], spec.response), caps & useful, spec.gel.haze)
     slopes: dict[str, np.ndarray] = {}
-    rms: list[tuple[float, float]] = []
     for step in range(STEPS):
         light = np.concatenate([m.light(layout.knobs(x)) for m in models])
         if step % SLOPES_EVERY == 0:
@@ -161,15 +144,8 @@ def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress: Step) -> P
         jacobian = layout.jacobian(slopes, light, veil, x[-1], levels_slope(seen, spec.response)) * useful[:, None, None]
         x = x + np.clip(layout.move(jacobian, residual, x, len(frames)), -LARGEST_STEP, LARGEST_STEP)
         x[-1] = np.clip(x[-1], 0, MOST_HAZE)
-        rms.append((_rms(residual[caps & useful]), _rms(residual[~caps & useful])))
         progress(step + 1, STEPS)
-    first, last = rms[0], rms[-1]
-    return PhotometryFit(layout.apply_values(spec, x), (first[0], last[0]), (first[1], last[1]))
-
-
-def _rms(residual: np.ndarray) -> float:
-    """Root mean square."""
-    return float(np.sqrt(np.mean(residual**2)))
+    return layout.apply_values(spec, x)
 
 
 class _Layout:

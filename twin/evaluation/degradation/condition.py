@@ -78,6 +78,7 @@ SettingChange = Callable[[DetectorSpec, float], DetectorSpec]
 
 
 S = TypeVar("S", bound=Section)
+T = TypeVar("T")
 
 
 class SectionChange(Protocol[S]):
@@ -191,47 +192,43 @@ class DegradedCase:
         """The parameters' values in words."""
         return ", ".join(f"{c.value(severity):.3g} {c.unit}".strip() for c in self.conditions)
 
-    def _acting(self, stage: str, severity: float) -> list[tuple[Any, float, Condition]]:
-        """The changes at a stage, the field of `Condition` with this name, with their values. At severity 0 nothing acts."""
-        changes = [(getattr(c, stage), c.value(severity), c) for c in self.conditions]
-        return [each for each in changes if each[0] is not None] if severity > 0 else []
+    def _through(self, stage: str, thing: T, severity: float, *more: Any, draw: int | None = None) -> T:
+        """The thing after the changes at a stage, the field of `Condition` with this name. At severity 0 nothing acts.
+
+        Each change gets the thing, its value, ``more`` and, with ``draw``, random numbers.
+        """
+        for c in self.conditions if severity > 0 else ():
+            if (change := getattr(c, stage)) is not None:
+                thing = change(thing, c.value(severity), *more, *([] if draw is None else [c.rng(draw)]))
+        return thing
 
     def on_spec(self, spec: SensorSpec, severity: float) -> SensorSpec:
         """The degraded specification."""
-        for change, value, c in self._acting("spec", severity):
-            spec = change(spec, value, c.rng())
-        return spec
+        return self._through("spec", spec, severity, draw=0)
 
     def on_light(self, light: np.ndarray, severity: float, view: PictureView, draw: int) -> np.ndarray:
         """Degraded linear light."""
-        for change, value, c in self._acting("light", severity):
-            light = change(light, value, view, c.rng(draw))
-        return light
+        return self._through("light", light, severity, view, draw=draw)
 
     def on_frame(self, image: np.ndarray, severity: float, view: PictureView, draw: int) -> np.ndarray:
         """A degraded frame."""
-        for change, value, c in self._acting("frame", severity):
-            image = change(image, value, view, c.rng(draw))
-        return image
+        return self._through("frame", image, severity, view, draw=draw)
 
     def on_points(self, px: np.ndarray, severity: float, view: PictureView) -> np.ndarray:
         """The places to which points (n, 2) are moved."""
-        for move, value, _ in self._acting("moves", severity):
-            px = move(px, value, view)
-        return px
+        return self._through("moves", px, severity, view)
 
     def missing_caps(self, severity: float, view: PictureView) -> np.ndarray:
         """(N,) bool: caps that are gone."""
         gone = np.zeros(len(view.caps_px), bool)
-        for hides, value, c in self._acting("hides", severity):
-            gone |= hides(value, view, c.rng())
+        for c in self.conditions if severity > 0 else ():
+            if c.hides is not None:
+                gone |= c.hides(c.value(severity), view, c.rng())
         return gone
 
     def on_setting(self, detector: DetectorSpec, severity: float) -> DetectorSpec:
         """The detector with wrong settings."""
-        for change, value, _ in self._acting("setting", severity):
-            detector = change(detector, value)
-        return detector
+        return self._through("setting", detector, severity)
 
 
 def choose_share(count: int, share: float, rng: np.random.Generator) -> np.ndarray:

@@ -144,14 +144,7 @@ def _run_cell(plan: SweepSettings, folder: Path, models: dict[str, Callable[[Fra
     if worst is not None:
         picture = cv2.imencode(".jpg", overlay(worst[1], worst[2]))[1].tobytes()
         write_bytes(folder / "pictures" / f"{cell.file}.jpg", picture)
-    keep_json(folder / CELLS, cell.item, rows, default=_plain_number)
-
-
-def _plain_number(value: object) -> float:
-    """A number of NumPy as a number that JSON can represent."""
-    if isinstance(value, np.number | np.bool_):
-        return float(value)
-    raise TypeError(f"expected a number, got {type(value).__name__}")
+    keep_json(folder / CELLS, cell.item, rows)
 
 
 def _pose(estimate: Callable[[Frame], ModelAnswer], degraded: DegradedFrame) -> dict:

@@ -12,10 +12,9 @@ import numpy as np
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
-from twin.camera.projection import project
+from twin.camera.projection import project_in_form
 from twin.errors import FrameError
 from twin.frames import open_recording
-from twin.frames.forms import from_raw
 from twin.geometry.solid import Resolution
 from twin.mechanics.solver import SkinSolver
 from twin.pins import Pipeline
@@ -140,4 +139,4 @@ class ContactModel:
         return self._pixels(tapped_mm) - self.rest_px, self._pixels(state.caps_mm) - self.rest_px
 
     def _pixels(self, caps_mm: np.ndarray) -> np.ndarray:
-        return from_raw(self.spec.recording, self.form, project(self.spec.view, caps_mm))
+        return project_in_form(self.spec, self.form, caps_mm)

@@ -22,7 +22,7 @@ from scenes.rig import RigSpec
 from twin.camera.projection import project
 from twin.errors import FrameError
 from twin.mechanics.solver import SkinSolver
-from twin.progress import Step, unheard
+from twin.progress import Step, report_each, unheard
 from twin.rig.contact import RigContact
 from twin.rig.kinematics import object_pose
 from twin.rig.labels import ArmLabel
@@ -92,11 +92,8 @@ class PlateTaps:
 
     def pins_px(self, rig: RigSpec, labels: list[ArmLabel], progress: Step = unheard) -> np.ndarray:
         """Pins (m, N, 2) px of the labels' contacts."""
-        contact, pins = self.contact(rig), []
-        for label in labels:
-            pins.append(project(self.solver.spec.view, contact.end(label).caps_mm))
-            progress(len(pins), len(labels))
-        return np.array(pins)
+        contact = self.contact(rig)
+        return np.array([project(self.solver.spec.view, contact.end(label).caps_mm) for label in report_each(labels, progress)])
 
 
 class TapBank:

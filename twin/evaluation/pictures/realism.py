@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -14,27 +14,12 @@ from twin.evaluation.pictures.compare import fixed_residual, pin_aligned, pose_a
 from twin.evaluation.pictures.frames import FEW_LOST, read_real
 from twin.optics.relief import without as plain_of
 from twin.progress import Progress, Step, silent, stage
+from twin.store import made_by, write_json
 from twin.types import Quality
 
-
-class PatchTwoSample(Protocol):
-    """Result of a two-sample test: fraction of correctly classified patches, and its interval."""
-
-    @property
-    def accuracy(self) -> float:
-        """Fraction of the patches that were classified correctly."""
-
-    @property
-    def low(self) -> float:
-        """Lower end of its 95 % interval."""
-
-    @property
-    def high(self) -> float:
-        """Upper end of its 95 % interval."""
-
-
-# Two-sample tests: ``test(real images, rendered images, inside, progress)`` gives their results by name.
-Test = Callable[[list[np.ndarray], list[np.ndarray], np.ndarray, Step], Mapping[str, PatchTwoSample]]
+# Two-sample tests: ``test(real images, rendered images, inside, progress)`` gives their results by name, each with the fraction
+# of correctly classified patches as ``accuracy``, and the ends of its 95 % interval as ``low`` and ``high``.
+Test = Callable[[list[np.ndarray], list[np.ndarray], np.ndarray, Step], Mapping[str, Any]]
 
 
 def run_realism(
@@ -94,7 +79,7 @@ def run_realism(
     poses = pose_aligned(spec, real.frames, disc, quality=quality, bar=bar) if with_poses else None
     with bar("measure caps, skin, noise, spectra") as step:
         found = statistics(pairs, disc, spec.pipeline.raw.polarity, progress=step)
-    outcome: Mapping[str, PatchTwoSample] = {}
+    outcome: Mapping[str, Any] = {}
     if test is not None and len(pairs) > 1:
         with bar("train the two-sample test") as step:
             outcome = test([pair.real.frame.image for pair in pairs], [pair.image for pair in pairs], disc.inside, step)
@@ -116,5 +101,5 @@ def run_realism(
     rows = report.write_pictures(pictures, pairs, "pins")
     pose_rows = report.write_pictures(pictures, poses.pairs, "pose") if poses else []
     page = report.write_page(out / "index.html", spec, metrics, report.write_plots(pictures, found), rows, pose_rows, found)
-    written = [page, report.write_metrics(out / "metrics.json", metrics), *report.write_tables(out, pairs, found, poses)]
-    return metrics, written
+    numbers = write_json(out / "metrics.json", metrics | {"made_by": made_by(report.__name__)})
+    return metrics, [page, numbers, *report.write_tables(out, pairs, found, poses)]

@@ -16,7 +16,6 @@ from twin.frames.images import write_image
 from twin.report.charts import sized_figure, write_chart
 from twin.report.page import Page, PagePicture
 from twin.report.table import Cell, Column, number, write_rows
-from twin.store import made_by, write_json
 
 NAMES = {
     "level": "cap level, gray",
@@ -135,18 +134,6 @@ def _spectrum_figure(found: Statistics) -> Figure:
     ax.set(xlabel="cycles per px", ylabel="power, squared gray levels")
     ax.legend()
     return figure
-
-
-def _plain_number(value: object) -> object:
-    """A number of NumPy as a number that JSON can hold."""
-    if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(f"expected a number, got {type(value).__name__}")
-
-
-def write_metrics(path: Path, metrics: dict) -> Path:
-    """Write ``metrics.json``; numbers of NumPy are allowed in the metrics."""
-    return write_json(path, metrics | {"made_by": made_by(__name__)}, default=_plain_number)
 
 
 def image_columns(*, mark_best: bool = False) -> list[Column]:

@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from scenes.base import Fraction, Name, Positive, Section, SpecError
 from scenes.load import read_section
 from scenes.sensor import BlobSpec, CameraSpec, Polarity, RecordingSpec, SensorSpec
+from scenes.write import toml_document
 from twin.camera.projection import project
 from twin.errors import ErrorsAs, FrameError
 from twin.frames.forms import blob_spec, known_sizes
@@ -115,11 +116,10 @@ class DetectorSpec(Section):
         if not levels or self.method == OWN:
             return self
         if self.method == "legacy" and self.recording is not None:
-            moved = self.recording.model_copy(update={"threshold_offset": self.recording.threshold_offset - levels})
-            return self.model_copy(update={"recording": moved})
+            return self.alter(recording={"threshold_offset": self.recording.threshold_offset - levels})
         adaptive = self.method in ("twin", "adaptive") and self.blob.threshold_block_px
         threshold = self.blob.threshold - levels if adaptive else max(self.blob.threshold + levels, LEAST_LEVEL)
-        return self.model_copy(update={"blob": self.blob.model_copy(update={"threshold": threshold})})
+        return self.alter(blob={"threshold": threshold})
 
 
 def shipped_detector(spec: SensorSpec, form: Form, method: Method = "twin") -> DetectorSpec:
@@ -142,23 +142,21 @@ def with_detector(spec: SensorSpec, detector: DetectorSpec) -> SensorSpec:
         raise FrameError(
             f"'{detector.name}' was tuned for {len(detector.pins_px)} pins, {spec.name} has {spec.pins.count}: tune it for this sensor"
         )
-    blob = detector.blob.model_copy(update={"rest_px": detector.pins_px or detector.blob.rest_px})
-    pipeline = spec.pipeline.model_copy(update={str(detector.form): blob})
+    blob = detector.blob.alter(rest_px=detector.pins_px or detector.blob.rest_px)
+    pipeline = spec.pipeline.alter(**{str(detector.form): blob})
     changed: dict[str, Section | None] = {"pipeline": pipeline}
     size = detector.size_px
     if size is not None and size != known_sizes(spec).get(detector.form):
         width, height = size
         if detector.form == Form.RAW:
-            changed["pipeline"] = pipeline.model_copy(update={"usual_caps": None})  # caps have another edge width in frames of this size
+            changed["pipeline"] = pipeline.alter(usual_caps=None)  # caps have another edge width in frames of this size
             seen_px = np.array(detector.pins_px).reshape(-1, 2)
-            changed["camera"] = camera_seeing(spec, seen_px, np.arange(len(seen_px))).model_copy(
-                update={"width_px": width, "height_px": height}
-            )
+            changed["camera"] = camera_seeing(spec, seen_px, np.arange(len(seen_px))).alter(width_px=width, height_px=height)
         elif spec.recording is not None:
-            changed["recording"] = spec.recording.model_copy(update={"width_px": width, "height_px": height})
+            changed["recording"] = spec.recording.alter(width_px=width, height_px=height)
         else:
             changed["recording"] = whole_recording((spec.camera.width_px, spec.camera.height_px), size, blob.polarity)
-    return spec.model_copy(update=changed)
+    return spec.alter(**changed)
 
 
 def whole_recording(camera_px: tuple[int, int], size_px: tuple[int, int], polarity: Polarity) -> RecordingSpec:
@@ -181,7 +179,7 @@ def camera_seeing(spec: SensorSpec, pins_px: np.ndarray, known: np.ndarray) -> C
     middle, seen_middle = ours.mean(axis=0), seen.mean(axis=0)
     scale = float(np.sqrt(np.sum((seen - seen_middle) ** 2) / np.sum((ours - middle) ** 2)))
     cx, cy = (seen_middle + scale * (np.array([camera.cx_px, camera.cy_px]) - middle)).tolist()
-    return camera.model_copy(update={"fx_px": scale * camera.fx_px, "fy_px": scale * camera.fy_px, "cx_px": cx, "cy_px": cy})
+    return camera.alter(fx_px=scale * camera.fx_px, fy_px=scale * camera.fy_px, cx_px=cx, cy_px=cy)
 
 
 def load_detector(path: Path) -> DetectorSpec:
@@ -204,15 +202,6 @@ def write_detector(path: Path, detector: DetectorSpec, comment: str = "") -> Non
     StoreError
         The file can't be written; the error's ``unsaved`` has its text.
     """
-    document = tomlkit.document()
-    for line in comment.splitlines():
-        document.add(tomlkit.comment(line))
     data = {key: value for key, value in detector.model_dump(mode="json").items() if value is not None and key != "name"}
-    pins = tomlkit.array()
-    for x, y in data["pins_px"]:
-        pins.add_line([round(x, 2), round(y, 2)])
-    pins.add_line(indent="")
-    data["pins_px"] = pins
-    for key in sorted(data, key=lambda k: isinstance(data[k], dict)):  # tables come last
-        document.add(key, data[key])
-    write_result(path.parent, {path.name: tomlkit.dumps(document)})
+    data["pins_px"] = [[round(x, 2), round(y, 2)] for x, y in detector.pins_px]
+    write_result(path.parent, {path.name: tomlkit.dumps(toml_document(data, comment))})

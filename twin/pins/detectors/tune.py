@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypedDict
+from typing import Literal
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from twin.pins.labelling.identify import (
 from twin.pins.labelling.reference import Reference, make_reference, nominal_reference, together
 from twin.pins.labelling.rest import Rest, rest_of
 from twin.pins.labelling.view import camera_modes, view_of
-from twin.progress import Step, unheard
+from twin.progress import Step, report_each, unheard
 from twin.types import Form, Frame
 
 # Number of frames that are used, spread evenly. With more frames the parameters hardly change.
@@ -76,15 +76,6 @@ FAIR_RATE = 0.5
 Rate = tuple[float, float]
 
 
-class RateRow(TypedDict):
-    """A setting that was tried, and its result."""
-
-    block_px: int
-    threshold: float
-    exact_rate: float
-    found_share: float
-
-
 @dataclass(frozen=True)
 class Tuned:
     """The result of a tuning.
@@ -92,8 +83,6 @@ class Tuned:
     Attributes
     ----------
     detector : DetectorSpec
-    rates : list of RateRow
-        All settings that were tried.
     notes : list of str
         Reasons to doubt the result, and what to do.
     rest : Rest
@@ -101,7 +90,6 @@ class Tuned:
     """
 
     detector: DetectorSpec
-    rates: list[RateRow]
     notes: list[str]
     rest: Rest
 
@@ -168,21 +156,16 @@ def tune(
         judged = frames[:: max(len(frames) // SLOW_TUNED_ON, 1)][:SLOW_TUNED_ON]
     rates = [_rate(make_detector(sensor, detector, second_look=False), judged[::GLANCE]) for detector in tried]
     hopeful = max(map(sum, rates)) - HOPELESS
-    for k, detector in enumerate(tried):
+    for k, detector in enumerate(report_each(tried, progress)):
         if sum(rates[k]) >= hopeful:
             rates[k] = _rate(make_detector(sensor, detector, second_look=False), judged)
-        progress(k + 1, len(tried))
     best = _middle_of_plateau(tried, rates)
     evidence = _evidence(tried, rates, best, judged, reference, start)
     if doubts:
-        evidence = evidence.model_copy(update={"sure": "unsure"})
-    table: list[RateRow] = [
-        {"block_px": _block(d), "threshold": _threshold(d), "exact_rate": exact, "found_share": share}
-        for d, (exact, share) in zip(tried, rates, strict=True)
-    ]
+        evidence = evidence.alter(sure="unsure")
     seen = sum(one.explained >= SHOWN for one in layout.seen)
-    found = _at_rest(tried[best].model_copy(update={"evidence": evidence}), sensor.pins, rest, layout)
-    return Tuned(found, table, doubts + _notes(tried[best], evidence, seen, len(frames)), rest)
+    found = _at_rest(tried[best].alter(evidence=evidence), sensor.pins, rest, layout)
+    return Tuned(found, doubts + _notes(tried[best], evidence, seen, len(frames)), rest)
 
 
 def _at_rest(detector: DetectorSpec, pins: PinsSpec, rest: Rest, layout: Candidate) -> DetectorSpec:
@@ -192,8 +175,8 @@ def _at_rest(detector: DetectorSpec, pins: PinsSpec, rest: Rest, layout: Candida
     places = np.where(unseen[:, None], layout.rest_px, rest.pins_px)
     smooth = smooth_view(pin_lattice(pins).places, rest.pins_px)
     places = turned_as(pins, np.where((unseen & together(places.round(2)))[:, None], smooth, places))
-    blob = detector.blob.model_copy(update={"rest_origin": "contacts" if rest.source == "made" else "measured"})
-    return detector.model_copy(update={"pins_px": tuple(map(tuple, places.round(2).tolist())), "blob": blob})
+    blob = {"rest_origin": "contacts" if rest.source == "made" else "measured"}
+    return detector.alter(pins_px=tuple(map(tuple, places.round(2).tolist())), blob=blob)
 
 
 def _shown_instead(images: list[np.ndarray]) -> str:
@@ -323,30 +306,24 @@ def _settings(start: DetectorSpec, reference: Reference, contrast: float, binary
     if start.method == "twin":
         cap = start.radius_px[0] / CAP_RADII[0]
         for share in SPOT_SIZES:
-            yield _with_blob(start, spot_sigma_px=round(share * cap, 2))
+            yield start.alter(blob={"spot_sigma_px": round(share * cap, 2)})
     if start.method == "legacy" and start.recording is not None:
         for block in (int(p * pitch) | 1 for p in RECORDER_BLOCKS_PITCHES):
             for level in levels:
-                recording = start.recording.model_copy(update={"threshold_block_px": block, "threshold_offset": -level})
-                yield start.model_copy(update={"recording": recording})
+                yield start.alter(recording={"threshold_block_px": block, "threshold_offset": -level})
     elif start.method == "legacy":  # the published threshold is a part of the method
         yield start
     elif binary or start.method in ("fixed", "simple"):
         for level in BINARY_LEVELS if binary else RAW_LEVELS:
-            yield _with_blob(start, threshold=level)
+            yield start.alter(blob={"threshold": level})
     elif start.method in ("twin", "adaptive"):
         for erosion in EROSIONS_PX:
             for block in (int(p * pitch) | 1 for p in BLOCK_PITCHES):
                 for level in levels:
-                    yield _with_blob(start, threshold=-level, threshold_block_px=block, erosion_px=erosion)
+                    yield start.alter(blob={"threshold": -level, "threshold_block_px": block, "erosion_px": erosion})
     else:
         for level in levels:
-            yield _with_blob(start, threshold=level)
-
-
-def _with_blob(detector: DetectorSpec, **values: Any) -> DetectorSpec:
-    """The detector with values of its ``blob`` changed."""
-    return detector.model_copy(update={"blob": detector.blob.model_copy(update=values)})
+            yield start.alter(blob={"threshold": level})
 
 
 def _rate(detect: Callable[[Frame], Found], frames: list[Frame]) -> Rate:
@@ -356,11 +333,6 @@ def _rate(detect: Callable[[Frame], Found], frames: list[Frame]) -> Rate:
     return float(np.mean(found == count)), float(np.mean(1 - np.minimum(np.abs(found - count) / count, 1)))
 
 
-def _block(detector: DetectorSpec) -> int:
-    """Side of the adaptive threshold's block, px; the recorder's if there is one."""
-    return detector.recording.threshold_block_px if detector.recording is not None else detector.blob.threshold_block_px
-
-
 def _threshold(detector: DetectorSpec) -> float:
     """Threshold, gray levels; the recorder's if there is one."""
     return detector.recording.threshold_offset if detector.recording is not None else detector.blob.threshold
@@ -368,18 +340,13 @@ def _threshold(detector: DetectorSpec) -> float:
 
 def _series_of(d: DetectorSpec) -> tuple[int, int, float]:
     """Parameters that all settings of one series have in common."""
-    return _block(d), d.blob.erosion_px, d.blob.spot_sigma_px
-
-
-def _series(tried: list[DetectorSpec], k: int) -> list[int]:
-    """Indices of the settings that differ from the k-th only in the threshold, in the order of the thresholds."""
-    same = [j for j, d in enumerate(tried) if (_block(d), d.blob.erosion_px, d.blob.spot_sigma_px) == _series_of(tried[k])]
-    return sorted(same, key=lambda j: _threshold(tried[j]))
+    return (d.recording or d.blob).threshold_block_px, d.blob.erosion_px, d.blob.spot_sigma_px
 
 
 def _plateau(tried: list[DetectorSpec], rates: list[Rate], k: int) -> list[int]:
     """Indices of the k-th setting and of those with neighbouring thresholds whose rates are nearly as good."""
-    series = _series(tried, k)
+    series = [j for j, detector in enumerate(tried) if _series_of(detector) == _series_of(tried[k])]
+    series.sort(key=lambda j: _threshold(tried[j]))
     at = series.index(k)
     low = high = at
     good = [sum(rates[j]) >= sum(rates[k]) - NEAR for j in series]

@@ -433,7 +433,7 @@ def _first_guesses(by: Family, spots: list[Bumps]) -> list[tuple[PinsSpec, list[
 
 def _part(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[PinsSpec, LayoutInFrame] | None:
     """The part of a lattice in a frame: the layout, and its pins in the frame."""
-    part = by.kind.find(spot >= 0, _family_in_view(by, spots, spot)) if by.kind else None
+    part = by.kind.find(spot >= 0, in_view(locate_places(by.lattice, by.around, spots.px, spot, spots.size_px), spots)) if by.kind else None
     return None if part is None else (_pins_of(part[0]), _place_lattice(spots, spot, by, part[1]))
 
 
@@ -450,11 +450,6 @@ def _as_layout(pins: PinsSpec, by: Family, spots: Bumps, spot: np.ndarray) -> La
         return _place_lattice(spots, spot, by, np.arange(len(by.lattice)))
     nodes = shape.at_most_labels(spot >= 0)
     return None if nodes is None else _place_lattice(spots, spot, by, np.delete(nodes, list(pins.missing)))
-
-
-def _family_in_view(by: Family, spots: Bumps, spot: np.ndarray) -> np.ndarray:
-    """(M,) bool: whether each place of a lattice is in view. A place without a prediction counts as not in view."""
-    return in_view(locate_places(by.lattice, by.around, spots.px, spot, spots.size_px), spots)
 
 
 def _candidate(pins: PinsSpec, seen: list[LayoutInFrame], spots: list[Bumps], *, may_miss: bool = True) -> Candidate:

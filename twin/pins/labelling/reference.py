@@ -8,10 +8,10 @@ from scipy.spatial import Delaunay, cKDTree
 
 from scenes.pins import PinsSpec
 from scenes.sensor import SensorSpec
-from twin.camera.projection import project
+from twin.camera.projection import project_in_form
 from twin.compiled import compiled
 from twin.errors import FrameError
-from twin.frames.forms import form_named, from_raw
+from twin.frames.forms import form_named
 from twin.geometry.drift import coherent_motions
 from twin.geometry.pins import pin_lattice, rest_pins
 from twin.pins.flips import Net, net_of
@@ -172,7 +172,7 @@ def nominal_reference(spec: SensorSpec, form: Form) -> Reference:
 
 def project_rest(spec: SensorSpec, form: Form) -> np.ndarray:
     """Places (N, 2) in px at which the specification's camera sees its caps at rest."""
-    return from_raw(spec.recording, form, project(spec.view, rest_pins(spec.geometry).caps_mm))
+    return project_in_form(spec, form, rest_pins(spec.geometry).caps_mm)
 
 
 def _turned_alike(px: np.ndarray, triangles: np.ndarray) -> np.ndarray:

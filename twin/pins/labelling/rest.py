@@ -9,6 +9,7 @@ from scenes.pins import PinsSpec
 from twin.errors import FrameError
 from twin.geometry.pins import pin_lattice
 from twin.pins.labelling.identify import SHOWN, Candidate, score_layout, symmetries, unevenness
+from twin.pins.labelling.reference import mean_radius
 from twin.pins.labelling.view import MOST_UNEVEN, uneven_dent
 
 STILL = 0.035
@@ -143,12 +144,7 @@ def spread_of(pins: PinsSpec, pins_px: np.ndarray) -> float:
     lattice, known = pin_lattice(pins), np.isfinite(pins_px[:, 0])
     inner = known & (np.linalg.norm(lattice.places, axis=1) < INNER)
     rim = lattice.outmost[known[lattice.outmost]]
-    return _radius(pins_px[inner]) / _radius(pins_px[rim]) if inner.any() and len(rim) else np.inf
-
-
-def _radius(px: np.ndarray) -> float:
-    """Mean distance of points (n, 2) from their mean."""
-    return float(np.linalg.norm(px - px.mean(axis=0), axis=1).mean())
+    return mean_radius(pins_px[inner]) / mean_radius(pins_px[rim]) if inner.any() and len(rim) else np.inf
 
 
 def _alike(layout: Candidate, pins_px: np.ndarray) -> np.ndarray:

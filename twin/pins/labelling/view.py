@@ -13,9 +13,8 @@ import numpy as np
 
 from scenes.pins import PinsSpec
 from scenes.sensor import SensorSpec
-from twin.camera.projection import project
+from twin.camera.projection import project_in_form
 from twin.errors import FrameError
-from twin.frames.forms import from_raw
 from twin.geometry.pins import namings, pin_lattice, rest_pins
 from twin.pins.labelling.identify import smooth_view
 from twin.pins.labelling.reference import Reference, make_reference
@@ -172,12 +171,11 @@ UNDECIDED = (
 
 def camera_modes(spec: SensorSpec, form: Form) -> np.ndarray:
     """Motions (4, N, 2), px, of the pins at rest by a tilt about x and y, another distance and another distortion of the camera."""
-    caps_mm, view = rest_pins(spec.geometry).caps_mm, spec.view
-    steps = {"tilt_x_deg": TILT_DEG, "tilt_y_deg": TILT_DEG, "distance_mm": NEARER * view.camera.distance_mm, "k1": CURVED}
+    steps = {"tilt_x_deg": TILT_DEG, "tilt_y_deg": TILT_DEG, "distance_mm": NEARER * spec.camera.distance_mm, "k1": CURVED}
 
     def project_with(**added: float) -> np.ndarray:
-        camera = view.camera.model_copy(update={key: getattr(view.camera, key) + by for key, by in added.items()})
-        return from_raw(spec.recording, form, project(view.model_copy(update={"camera": camera}), caps_mm))
+        camera = {key: getattr(spec.camera, key) + by for key, by in added.items()}
+        return project_in_form(spec.alter(camera=camera), form, rest_pins(spec.geometry).caps_mm)
 
     return np.stack([project_with(**{key: by}) for key, by in steps.items()]) - project_with()
 

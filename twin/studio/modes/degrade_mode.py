@@ -22,7 +22,7 @@ from twin.studio.modes.twin_mode import TwinMode
 from twin.studio.page import StudioPage, put
 from twin.studio.pictures import badge, estimate_table, paragraph
 from twin.studio.pose import ObjectPose
-from twin.types import Form, Frame, Observation
+from twin.types import Form, Observation
 
 SLIDERS = 3
 """Number of conditions that can act at once, each with its own severity."""
@@ -84,12 +84,9 @@ class FrameEvaluator:
         figures = measure_frame(self._detector, self._detector(shot.frame), shot)
         failed = tuple(m.title for m in MEASURES if m.exceeds(figures[m.name], self.limits[m.name]))
         model = self.contact.model
-        estimate = None if model is None else model(self._in_form(shot.frame, model.form))
+        estimate = None if model is None else model(shot.frame if model.form is Form.RAW else self.contact.camera.as_recorded(shot.frame))
         of_frame = model is not None and model.form is Form.RAW
         return EvaluatedFrame(shot, pins_in(shot.frame, estimate if of_frame else None, self._pipeline), figures, failed, estimate)
-
-    def _in_form(self, raw: Frame, form: Form) -> Frame:
-        return raw if form is Form.RAW else self.contact.camera.as_recorded(raw)
 
 
 class DegradeMode(PageMode):

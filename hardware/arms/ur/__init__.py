@@ -1,0 +1,1 @@
+"""Driver of a Universal Robots arm through ``ur_rtde``."""

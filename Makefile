@@ -56,8 +56,9 @@ film: setup      ## the studio's film and three pictures, in out/film; needs Deb
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,browser]'
 	@$(SCRIPT) tests/browser/film.py --out out/film
 
-gallery: setup   ## the pictures of the gallery, from the code of its page
+gallery: setup   ## the pictures of the gallery, from the code of its page, and the film of the gripper
 	@cd docs && PYTHONPATH=$(CURDIR) $(CURDIR)/$(BIN)/python -m generators.gallery
+	@cd docs && PYTHONPATH=$(CURDIR) MUJOCO_GL=$${MUJOCO_GL:-egl} $(CURDIR)/$(BIN)/python -m generators.gripper
 
 browser: setup   ## the studio in a real Chromium, wide and narrow; pictures in out/browser; skipped without Debian's chromium
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,browser]'

@@ -17,9 +17,9 @@ from training.mujoco.task import PERIOD_S
 
 FILM = DOCS / "pictures" / "gripper.webp"
 OBJECT = {"mass_kg": 0.18, "friction": 0.6}
-EVERY, OPENING, OPEN_M, QUALITY = 2, 12, 0.012, 60
+EVERY, OPENING, OPEN_M, QUALITY = 5, 12, 0.012, 30
 """Decisions from picture to picture, decisions in which the hand opens at the end, how far, and the quality of the pictures."""
-SIDE_PX = 180
+SIDE_PX = 120
 
 
 def film() -> Path:

@@ -279,6 +279,17 @@ def test_a_lift_is_repeated_exactly_by_its_seed_and_is_an_environment_for_gymnas
     check_env(env, skip_render_check=True)
 
 
+@pytest.mark.parametrize(("task", "size"), [("GraspLift", 1), ("PegInsert", 4)])
+def test_actions_that_are_no_numbers_are_refused_and_move_nothing(task, size):
+    env = gymnasium.make(f"tactip/{task}-v0", observation="none", disable_env_checker=True)
+    env.reset(seed=0)
+    before = env.unwrapped.scene.data.qpos.copy()
+    for action in (np.full(size, np.nan), np.zeros(size + 1)):
+        with pytest.raises(OptionError, match="finite numbers"):
+            env.step(action)
+    assert np.array_equal(env.unwrapped.scene.data.qpos, before)
+
+
 def test_a_scripted_controller_inserts_pegs_by_what_the_sensors_feel():
     env = gymnasium.make("tactip/PegInsert-v0", observation="none").unwrapped
     solved = 0

@@ -12,6 +12,7 @@ import numpy as np
 
 from training.mujoco.geoms import MM
 from training.mujoco.task import PERIOD_S, GripperTask
+from twin.errors import OptionError
 from twin.types import FloatArray
 
 GRIP_S, LIFT_S, HOLD_S, LOWER_S = 0.5, 2.5, 2.0, 1.0
@@ -49,6 +50,8 @@ class GraspLift(GripperTask):
         All ratios of least grips are equally probable; mass and friction are drawn from those that need the drawn grip.
         """
         super().reset(seed=seed)
+        if set(options or {}) - {"mass_kg", "friction"}:
+            raise OptionError(f"reset(options=...) takes mass_kg and friction, not {', '.join(options or {})}")
         least_n = float(np.exp(self.np_random.uniform(*np.log(LEAST_N))))
         friction = self.np_random.uniform(*np.clip(np.array(MASS_KG) * 9.81 / (2 * least_n), *FRICTION))
         drawn = {"mass_kg": 2 * friction * least_n / 9.81, "friction": friction} | (options or {})
@@ -67,8 +70,9 @@ class GraspLift(GripperTask):
 
     def step(self, action: FloatArray) -> tuple[dict[str, FloatArray], float, bool, bool, dict[str, Any]]:
         """Move fingers and hand; see gymnasium. The reward of a step is at most 1, and 0 where the episode fails."""
+        closing = self.as_action(action)[0]
         self._done += 1
-        self._fingers = float(np.clip(self._fingers + GRIP_MM * np.clip(np.ravel(action)[0], -1, 1), 0.0, MOST_CLOSED_MM))
+        self._fingers = float(np.clip(self._fingers + GRIP_MM * closing, 0.0, MOST_CLOSED_MM))
         lifted = GRIP_S, GRIP_S + LIFT_S, GRIP_S + LIFT_S + HOLD_S, STEPS * PERIOD_S
         share = float(np.interp(self._done * PERIOD_S, lifted, [0.0, 1.0, 1.0, 0.0]))
         self.hand_mm = LIFT_MM * (1 - float(np.cos(np.pi * share))) / 2

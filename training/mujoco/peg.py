@@ -55,7 +55,7 @@ class PegInsert(GripperTask):
 
     def step(self, action: FloatArray) -> tuple[dict[str, FloatArray], float, bool, bool, dict[str, Any]]:
         """Move the hand; see gymnasium. The reward of a step is at most 1, and 0 where the episode fails."""
-        self.hand += np.clip(np.asarray(action, float), -1.0, 1.0) * [*STEP_MM, STEP_DEG]
+        self.hand += self.as_action(action) * [*STEP_MM, STEP_DEG]
         self.hand = np.clip(self.hand, [-15.0, -15.0, -50.0, -12.0], [15.0, 15.0, 20.0, 12.0])
         self._drive()
         self.settle()

@@ -72,6 +72,19 @@ class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
         self.observation_space = cast(spaces.Space[dict[str, FloatArray]], spaces.Dict(box))
         self.action_space = spaces.Box(-1.0, 1.0, self.shape[1:], np.float32)
 
+    def as_action(self, action: FloatArray) -> FloatArray:
+        """An action as numbers in [-1, 1].
+
+        Raises
+        ------
+        OptionError
+            It has another shape, or is not finite.
+        """
+        numbers = np.asarray(action, float)
+        if numbers.shape != self.shape[1:] or not np.isfinite(numbers).all():
+            raise OptionError(f"an action of {self.shape[1]} finite numbers is expected, got {numbers}")
+        return np.clip(numbers, -1.0, 1.0)
+
     def begin(self, fingers_mm: float) -> None:
         """Set the model to its start, with the fingers closed so far."""
         mujoco.mj_resetData(self._model, self.scene.data)

@@ -128,6 +128,10 @@ INSIDE = {
 }
 
 
+SPECIFICATION = re.compile(r"(<class '|tuple\[)?[\w.]*(Sensor|Object|Experiment|Randomisation|Servo)Spec\b")
+"""Annotation of an argument that is a specification, or a tuple of them."""
+
+
 def call(function: Callable[..., Made], given: Mapping[str, Any], **others: Any) -> Made:
     """Call a function, or make a plan, with those of a command's options (its ``locals()``) that are arguments of it.
 
@@ -144,11 +148,10 @@ def call(function: Callable[..., Made], given: Mapping[str, Any], **others: Any)
         if name not in takes or name in others or value is None:
             continue
         arguments[name] = tuple(value) if isinstance(value, list) else value
-        if kind := re.search(r"(Sensor|Object|Experiment|Randomisation|Servo)Spec", str(takes[name].annotation)):
-            load = getattr(scenes, f"load_{kind[1].lower()}")
-            several = "tuple[" in str(takes[name].annotation)
-            arguments[name] = tuple(map(load, names_in(value))) if several else load(value)
-            if kind[1] == "Sensor":
+        if kind := SPECIFICATION.match(str(takes[name].annotation)):
+            load = getattr(scenes, f"load_{kind[2].lower()}")
+            arguments[name] = tuple(map(load, names_in(value))) if kind[1] == "tuple[" else load(value)
+            if kind[2] == "Sensor":
                 arguments[name] = sensor_with(value, tuning, residual=given.get("residual", False))
     return function(**arguments | others)
 

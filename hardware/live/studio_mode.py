@@ -351,7 +351,9 @@ class LiveMode(PageMode):
             self.disconnect()
             model = self._twin.contact.model
             if model is None:
-                raise TwinError("there is no model of this sensor yet; wait until it is loaded, or start the studio with one (`model`)")
+                raise TwinError(
+                    "no model of this sensor is loaded; wait if it still loads, or train one and start the studio with it (`model`)"
+                )
             if not self._camera.value.strip():
                 raise TwinError("give a camera first: a number, /dev/videoN, http://..., a folder or a video")
             feed = CameraFeed(self._camera.value.strip(), self._arm.value.strip(), model)

@@ -1,4 +1,5 @@
-// Files and folders that are dropped on the page go to the upload button that is visible for them. A folder becomes an archive.
+// Files and folders that are dropped on the page go to the upload button that is visible for them. A folder, or several
+// files, become an archive.
 if (!window.takesDrops) {
   window.takesDrops = true;
   const table = Array.from({ length: 256 }, (_, n) => {
@@ -34,8 +35,9 @@ if (!window.takesDrops) {
   window.addEventListener("dragover", (event) => event.preventDefault());
   window.addEventListener("drop", async (event) => {
     event.preventDefault();
-    const entry = event.dataTransfer.items[0]?.webkitGetAsEntry?.();
-    const file = entry?.isDirectory ? await zip(await walk(entry, ""), entry.name) : event.dataTransfer.files[0];
+    const [first] = event.dataTransfer.files, entries = [...event.dataTransfer.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean);
+    const several = entries.length > 1 || entries[0]?.isDirectory, name = entries.length > 1 ? "dropped" : entries[0]?.name;
+    const file = several ? await zip((await Promise.all(entries.map((entry) => walk(entry, "")))).flat(), name) : first;
     const kind = /\.(stl|obj|ply)$/i.test(file?.name ?? "") ? ".stl" : ".zip";
     const input = document.querySelector(`input[type=file][accept*="${kind}"]`);
     if (!file || !input) return;

@@ -421,6 +421,7 @@ class TwinMode(PageMode):
             self._load_rest()
         if answer.arrived and self._kept != self.state:
             self._kept = self.state
+            self._out.mkdir(parents=True, exist_ok=True)
             self._kept.save(self._out / LAST_STATE)
         for follow in self.followers:
             follow(answer)

@@ -32,6 +32,7 @@ from twin.pins import make_graph, nominal_reference
 from twin.report.charts import new_figure, write_chart
 from twin.report.page import Page
 from twin.report.table import write_table
+from twin.store import write_json
 from twin.types import Form, Frame
 
 SENSOR = "mg400-127"
@@ -221,7 +222,7 @@ def realism_page(out: Path) -> Path:
     }
     rows, poses = realism.write_pictures(out / "pictures", pairs, "pins"), realism.write_pictures(out / "pictures", pairs[:1], "pose")
     realism.write_tables(out, pairs, found, None)
-    realism.write_metrics(out / "metrics.json", metrics)
+    write_json(out / "metrics.json", metrics)
     plots = realism.write_plots(out / "pictures", found)
     return realism.write_page(out / "index.html", load_sensor("ur5-331"), metrics, plots, rows, poses, found)
 

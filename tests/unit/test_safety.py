@@ -146,7 +146,7 @@ def test_limits_are_checked_data(tmp_path):
 )
 def test_limits_that_are_not_there_are_told_with_one_remedy(tmp_path, monkeypatch, given, told):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(DeviceError, match=f"^{told}.* magician, mg400, simulated, ur, or the path of a TOML file like") as caught:
+    with pytest.raises(DeviceError, match=f"^{told}.* magician, mg400, ros2, simulated, ur, or the path of a TOML file like") as caught:
         load_limits(given)
     assert str(caught.value).count("give ") == 1
 

@@ -199,7 +199,8 @@ class UR(BaseArm):
 
     def _ask(self, method: str, *arguments: Any, timeout_s: float = REPLY_S) -> Any:
         lost = lambda error: DeviceNotConnectedError(f"{self.name}: {method}: {error}; call connect()")  # noqa: E731
-        with ErrorsAs(ConnectionError, lost), ErrorsAs(RuntimeError, lambda error: DeviceError(f"{self.name}: {method}: {error}")):
+        refused = lambda error: DeviceError(f"{self.name}: {method}: {error}; look at its teach pendant, and at the cable")  # noqa: E731
+        with ErrorsAs(ConnectionError, lost), ErrorsAs(RuntimeError, refused):
             return self._client.ask(method, *arguments, timeout_s=timeout_s)
 
     def _newest(self, max_age_s: float = FEEDBACK_AGE_S) -> dict[str, Any]:

@@ -440,8 +440,19 @@ def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent)
         The frame without contact shows a contact, or not this sensor.
     """
     kept = KeptAlso(out, plan.also, plan.sensor)
-    devices = {key: getattr(plan, key) for key in ("camera", "arm", "form", "limits", "plain_light")}
-    rig = build_rig(plan.sensor, plan.obj, plan.servo.placement, plan.experiment, **devices, seed=plan.sampling_seed, at_once=True)
+    rig = build_rig(
+        plan.sensor,
+        plan.obj,
+        plan.servo.placement,
+        plan.experiment,
+        camera=plan.camera,
+        arm=plan.arm,
+        form=plan.form,
+        limits=plan.limits,
+        seed=plan.sampling_seed,
+        plain_light=plan.plain_light,
+        at_once=True,
+    )
     collection = Collection(out, _about(plan, rig), rig.source.form)
     before = collection.count
 

@@ -240,9 +240,19 @@ def follow(
         model = model.at_rest(rest)
     elif plan.at_rest != FIRST:
         model = model.seeking_rest()
-    devices = {key: getattr(plan, key) for key in ("camera", "arm", "limits", "seed", "plain_light")} | {"form": model.form}
-    experiment, at_once = load_experiment(plan.servo.experiment), plan.stream_hz is None
-    rig = build_rig(model.sensor, plan.obj, plan.servo.placement, experiment, **devices, at_once=at_once)
+    rig = build_rig(
+        model.sensor,
+        plan.obj,
+        plan.servo.placement,
+        load_experiment(plan.servo.experiment),
+        camera=plan.camera,
+        arm=plan.arm,
+        form=model.form,
+        limits=plan.limits,
+        seed=plan.seed,
+        plain_light=plan.plain_light,
+        at_once=plan.stream_hz is None,
+    )
     round_steps, wanted_mm = steps_round(rig.placed, plan.servo, 1.0)
     steps = plan.steps or round_steps
     if plan.steps:
@@ -462,16 +472,17 @@ def _write_study(out: Path, study: ServoStudy) -> Path:
     """Write the study's page, whose rows lead to the pages of the runs, and return its path."""
     page = Page("Following outlines", "twin study servo", topic="TacTip twin: study")
     page.lead = "Each model follows the outline of each object once in the twin."
-    units = ("", "", "mm", "mm", "deg", "%", "")
-    columns = [Column(key, title.removesuffix(f" {unit}"), unit) for (key, title), unit in zip(SHOWN.items(), units, strict=True)]
-    rows = [
-        {"model": model, "object": Cell(name, href=f"{folder_name(model)}/{name}/index.html"), "end": run.failure or "all steps made"}
-        | {key: value * (100 if key == "completed" else 1) for key, value in asdict(run.measures).items()}
-        if isinstance(run, Followed)
-        else {"model": model, "object": name, "end": run}
-        for (model, name), run in study.found.items()
-    ]
-    page.table(rows, ["model", "object", *columns, "end"], caption="S is the paper's smoothness; local S does not depend on the axes.")
+    columns = [Column(key, key, "%", scale=100) if key == "completed" else Column.of(key) for key in SHOWN]
+    rows: list[dict[str, Any]] = []
+    for (model, name), run in study.found.items():
+        if isinstance(run, str):
+            rows.append({"model": model, "object": name, "end": run})
+        else:
+            page_of_run = Cell(name, href=f"{folder_name(model)}/{name}/index.html")
+            rows.append({"model": model, "object": page_of_run, "end": run.failure or "all steps made", **asdict(run.measures)})
+    page.table(
+        rows, ["model", "object", *columns, "end"], caption="Smoothness is the paper's S; local smoothness does not depend on the axes."
+    )
     if (out / "study.png") in study.written:
         page.figures(PagePicture(out / "study.png", "The tool's path (thin) around each object (wide), for each model", width_px=1000))
     page.download(out / "study.csv", "all measures")

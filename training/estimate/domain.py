@@ -634,9 +634,13 @@ def domain_of(arrays: Mapping[str, np.ndarray], about: Mapping[str, Any], pins: 
     ValueError
         It belongs to other pins or labels.
     """
-    values: dict[str, Any] = {name: array.astype(float) for name, array in arrays.items()}
-    values |= {"lighter": int(about["lighter"]), "near": float(about["near"]), "blind": float(about["blind"])}
-    found = Domain(**values, simulated=bool(about.get("simulated", False)))
+    found = Domain(
+        **{name: array.astype(float) for name, array in arrays.items()},
+        lighter=int(about["lighter"]),
+        near=float(about["near"]),
+        blind=float(about["blind"]),
+        simulated=bool(about.get("simulated", False)),
+    )
     if found.mean.shape != (2 * pins,) or found.rate.shape != (labels,):
         raise ValueError("of other pins or labels")
     return found

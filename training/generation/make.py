@@ -101,14 +101,26 @@ def _row(config: GenerationConfig, draw: Draw, simulator: Simulator, state: Cont
     truth = cap_truth(draw.sensor, simulator.rest, state, config.form)
     grid = skin_map(draw.sensor.geometry, state)
     noise_px = config.randomisation.pin_noise_px if config.randomisation else 0.0
-    pins_px = truth.caps_px + noise_px * draw.noise.normal(size=truth.caps_px.shape)
-    single = {"caps_mm": truth.caps_mm, "caps_px": truth.caps_px, "rest_px": truth.rest_px, "pins_px": pins_px}
-    single |= {"skin_mm": state.nodes_mm[: simulator.solver.mesh.outer_count]}
-    single |= {f"map_{key}": getattr(grid, key) for key in ("force_n", "normal_n", "touched_mm2", "slipping_mm2")}
-    row = {key: value.astype(np.float32) for key, value in single.items()} | {"visible": truth.visible}
-    row |= {key: getattr(state, key) for key in ("force_n", "torque_nmm", "area_mm2", "T_sensor_object")}
-    row |= {key: getattr(label, key) for key in ("pose", "move", "executed")}
-    return row | {"slipping_mm2": float(state.point_area_mm2[state.slipping].sum())}
+    return {
+        "caps_mm": truth.caps_mm.astype(np.float32),
+        "caps_px": truth.caps_px.astype(np.float32),
+        "rest_px": truth.rest_px.astype(np.float32),
+        "pins_px": (truth.caps_px + noise_px * draw.noise.normal(size=truth.caps_px.shape)).astype(np.float32),
+        "visible": truth.visible,
+        "force_n": state.force_n,
+        "torque_nmm": state.torque_nmm,
+        "area_mm2": state.area_mm2,
+        "slipping_mm2": float(state.point_area_mm2[state.slipping].sum()),
+        "skin_mm": state.nodes_mm[: simulator.solver.mesh.outer_count].astype(np.float32),
+        "map_force_n": grid.force_n.astype(np.float32),
+        "map_normal_n": grid.normal_n.astype(np.float32),
+        "map_touched_mm2": grid.touched_mm2.astype(np.float32),
+        "map_slipping_mm2": grid.slipping_mm2.astype(np.float32),
+        "T_sensor_object": state.T_sensor_object,
+        "pose": label.pose,
+        "move": label.move,
+        "executed": label.executed,
+    }
 
 
 def _png(config: GenerationConfig, simulator: Simulator, state: ContactState, seed: int) -> bytes:

@@ -107,8 +107,19 @@ def compare_with_renders(
     if thorough and not test:
         raise OptionError("`thorough` adds to the two-sample test, but `two_sample=False` leaves it out; give one of them")
     asked = (_thorough if thorough else _quick) if test else None
-    options: dict[str, Any] = {"with_poses": pose_aligned, "limit": limit, "fitted": fitted, "without": without, "quality": quality}
-    return Realism(*run_realism(frames, sensor, out, **options, test=asked, progress=progress))
+    found = run_realism(
+        frames,
+        sensor,
+        out,
+        with_poses=pose_aligned,
+        limit=limit,
+        fitted=fitted,
+        without=without,
+        quality=quality,
+        test=asked,
+        progress=progress,
+    )
+    return Realism(*found)
 
 
 def _quick(real: list[np.ndarray], rendered: list[np.ndarray], inside: np.ndarray, step: Step) -> dict[str, TwoSample]:

@@ -98,8 +98,17 @@ class ObjectsPlan:
         return learnt + tests
 
     def _config(self, obj: ObjectSpec, experiment: ExperimentSpec, apart: int) -> GenerationConfig:
-        how: dict[str, Any] = {"randomisation": self.randomisation, "images": "none", "states": "all", "across": self.across}
-        return GenerationConfig(sensor=self.sensor, object=obj, experiment=experiment, friction=obj.friction, seed=self.seed + apart, **how)
+        return GenerationConfig(
+            sensor=self.sensor,
+            object=obj,
+            experiment=experiment,
+            randomisation=self.randomisation,
+            friction=obj.friction,
+            seed=self.seed + apart,
+            images="none",
+            states="all",
+            across=self.across,
+        )
 
     def trained_on(self, sets: dict[str, Dataset]) -> dict[str, Dataset]:
         """The data set that each model is trained on, by the model's name. Both have the same number of contacts."""

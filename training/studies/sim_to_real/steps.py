@@ -107,9 +107,17 @@ class Twin:
 
     def config(self, obj: ObjectSpec, seed: int) -> GenerationConfig:
         """Configuration of the twin's contacts, without pictures."""
-        how: dict[str, Any] = {"randomisation": self.randomisation, "images": "none", "states": "all", "across": self.across}
-        friction = rig_of(self.sensor).friction
-        return GenerationConfig(sensor=self.sensor, object=obj, experiment=self.experiment, friction=friction, seed=seed, **how)
+        return GenerationConfig(
+            sensor=self.sensor,
+            object=obj,
+            experiment=self.experiment,
+            randomisation=self.randomisation,
+            friction=rig_of(self.sensor).friction,
+            seed=seed,
+            images="none",
+            states="all",
+            across=self.across,
+        )
 
     def simulated_sets(
         self, plan: SimToRealPlan, out: Path, sensor: SensorSpec, form: Form, given: Sequence[Path], progress: Progress
@@ -253,10 +261,12 @@ def stands_and_moves(labels: Sequence[ArmLabel]) -> np.ndarray:
     return np.hstack(poses_and_moves(labels))
 
 
-def with_missing(simulated: Dataset, labels: list[ArmLabel], missing: Discrepancy, seed: int, *, progress: Step | None = None) -> Dataset:
-    """A simulated data set with what is missing, sampled for each contact, added to its pins; ``labels`` are its ``arm_labels``."""
+def with_missing(
+    simulated: Dataset, labels: list[ArmLabel], discrepancy: Discrepancy, seed: int, *, progress: Step | None = None
+) -> Dataset:
+    """A simulated data set with a discrepancy, sampled for each contact, added to its pins; ``labels`` are its ``arm_labels``."""
     pins = simulated.pins
-    missing_px = missing.draw_px(labels, pins.nodes_px - pins.reference.pins_px, contact_of(simulated), seed)
+    missing_px = discrepancy.draw_px(labels, pins.nodes_px - pins.reference.pins_px, contact_of(simulated), seed)
     nodes_px = pins.nodes_px + missing_px
     return replace(simulated, pins=replace(pins, nodes_px=nodes_px, area_px2=voronoi_areas(nodes_px, pins.reference, progress=progress)))
 

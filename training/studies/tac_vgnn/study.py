@@ -251,8 +251,11 @@ class TacVgnnPlan:
 
     def runs(self) -> list[PlannedRun]:
         """Every run of the study."""
-        settings: dict[str, Any] = {"labels": self.labels, "split": self.split, "epochs": self.epochs}
-        return [plan_run(name, seed=seed, **settings) for seed in self.seeds for name in self.models]
+        return [
+            plan_run(name, labels=self.labels, seed=seed, split=self.split, epochs=self.epochs)
+            for seed in self.seeds
+            for name in self.models
+        ]
 
 
 @dataclass(frozen=True, repr=False)

@@ -137,8 +137,19 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         goal = ", ".join(map(_in_units, batch.task.goal_names, batch.goals_for_agents()[0].tolist()))
         area = f"{felt.area_mm2[0]:.0f} mm2, {100 * felt.slip[0]:.0f} %"
         shown = {"goal": goal, "contact area, slipping": area, "not computed": felt.lost[0]}
-        seen = int(batch.steps_done[0]), frame, batch.backend.attitude(0), contact.obj, T, felt.force_n[0].copy()
-        self._page.show(EpisodeStep(*seen, T[:3, :3] @ place_mm + T[:3, 3], reward, {name: text for name, text in shown.items() if text}))
+        self._page.show(
+            EpisodeStep(
+                int(batch.steps_done[0]),
+                frame,
+                batch.backend.attitude(0),
+                contact.obj,
+                T,
+                felt.force_n[0].copy(),
+                T[:3, :3] @ place_mm + T[:3, 3],
+                reward,
+                {name: text for name, text in shown.items() if text},
+            )
+        )
         time.sleep(max(0.0, self._shown_s + 1 / RENDER_FPS - time.monotonic()))
         self._shown_s = time.monotonic()
 

@@ -1,7 +1,7 @@
 """Observations of an agent: pins, their graph, pictures, the estimator's pose, or the exact state."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, Literal, get_args
 
@@ -175,9 +175,20 @@ class Eye:
             seen = np.stack([node_features(graph, self.reference) for graph in graphs])
             return np.clip(seen, -LARGEST, LARGEST).astype(np.float32)
         assert self._estimator is not None
-        names, areas, lost = np.full(len(pins_px), ""), np.stack([graph.area_px2 for graph in graphs]), np.zeros(pins_px.shape[:2], bool)
-        pins = PinTable(self.sensor, self.form, self.reference, names, pins_px, areas, lost, ~lost[:, 0], measured=True)
-        told = self._estimator.predict_table(pins if light is None else replace(pins, light=light))
+        count = len(pins_px)
+        table = PinTable(
+            self.sensor,
+            self.form,
+            self.reference,
+            np.full(count, ""),
+            pins_px,
+            np.stack([graph.area_px2 for graph in graphs]),
+            np.zeros(pins_px.shape[:2], bool),
+            np.ones(count, bool),
+            measured=True,
+            light=np.zeros(0) if light is None else light,
+        )
+        told = self._estimator.predict_table(table)
         return self._scale_estimate(told.mean, told.executed)
 
     def _of_frames(self, rows: IntArray, frames: list[Frame]) -> tuple[FloatArray, BoolArray]:

@@ -415,10 +415,18 @@ class PinModel(Model):
         if touched < LIKELY:
             return Unseen(f"no contact (its probability is {touched:.0%})", touched, seen)
         reference = trained.pipeline.reference
-        row = np.array([frame.name]), seen.graph.nodes_px[None], seen.graph.area_px2[None], lost[None], np.ones(1, bool)
-        pins = PinTable(trained.sensor, trained.pipeline.form, reference, *row, measured=reference is not trained.reference)
-        if self.sees_light:
-            pins = replace(pins, light=cap_light(frame, seen.graph.nodes_px, reference)[None])
+        pins = PinTable(
+            trained.sensor,
+            trained.pipeline.form,
+            reference,
+            np.array([frame.name]),
+            seen.graph.nodes_px[None],
+            seen.graph.area_px2[None],
+            lost[None],
+            np.ones(1, bool),
+            measured=reference is not trained.reference,
+            light=cap_light(frame, seen.graph.nodes_px, reference)[None] if self.sees_light else np.zeros((1, len(lost))),
+        )
         return OneFrame(pins, touched, 1 - seen.found / max(seen.expected, 1), seen)
 
     def estimate_one(self, trained: Trained, seen: OneFrame) -> Prediction:

@@ -81,11 +81,19 @@ def solve_path(solver: SkinSolver, nodes: AtNodes, drawn: DrawnPath, *, step_mm:
     except ContactError:
         if len(states) == 1:
             return None
-    pins = (np.array([getattr(s, name) for s in states], np.float32) for name in ("base_mm", "axis"))
-    wrench = (np.array([getattr(s, name) for s in states]) for name in ("force_n", "torque_nmm"))
-    others = [(s.point_area_mm2.sum(), s.slip_share, nodes.moved_mm(s), nodes.force_n(s)) for s in states]
-    T = np.array([s.T_sensor_object for s in states])
-    return SolvedPath(drawn.shape, drawn.friction, T, *pins, *wrench, *map(np.array, zip(*others, strict=True)))
+    return SolvedPath(
+        drawn.shape,
+        drawn.friction,
+        np.array([s.T_sensor_object for s in states]),
+        np.array([s.base_mm for s in states], np.float32),
+        np.array([s.axis for s in states], np.float32),
+        np.array([s.force_n for s in states]),
+        np.array([s.torque_nmm for s in states]),
+        np.array([s.point_area_mm2.sum() for s in states]),
+        np.array([s.slip_share for s in states]),
+        np.array([nodes.moved_mm(s) for s in states]),
+        np.array([nodes.force_n(s) for s in states]),
+    )
 
 
 def solve_paths(sensor: SensorSpec, numbers: Sequence[int], *, processes: int, progress: Step) -> list[SolvedPath]:

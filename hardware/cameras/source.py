@@ -1,5 +1,6 @@
 """The protocol of all cameras: ``FrameSource``, a source of frames. Times are ``time.monotonic()`` seconds."""
 
+from contextlib import AbstractContextManager
 from types import TracebackType
 from typing import Protocol
 
@@ -72,6 +73,11 @@ class FrameSource(Protocol):
         """The first frame that was exposed after ``time_s``; ``TimeoutError`` if none comes."""
 
 
+def no_frame() -> AbstractContextManager[None]:
+    """Context that converts the errors of a camera that gives no frame to a ``DeviceError`` with the remedy."""
+    return ErrorsAs((TimeoutError, EOFError), lambda error: DeviceError(f"{error}; check the camera"))
+
+
 def await_frame(source: FrameSource, *, timeout_s: float | None = None, after_s: float | None = None) -> Frame:
     """The next frame, or the first one that was exposed after ``after_s``. By default the wait lasts at most ``first_frame_s``.
 
@@ -81,5 +87,5 @@ def await_frame(source: FrameSource, *, timeout_s: float | None = None, after_s:
         No frame comes.
     """
     timeout_s = source.first_frame_s if timeout_s is None else timeout_s
-    with ErrorsAs((TimeoutError, EOFError), lambda error: DeviceError(f"{error}; check the camera")):
+    with no_frame():
         return source.read(timeout_s=timeout_s) if after_s is None else source.read_after(after_s, timeout_s=timeout_s)

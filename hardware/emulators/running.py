@@ -60,19 +60,20 @@ def emulate_mg400(
     lenient : bool
         See ``Mg400Emulator``.
     """
-    _require_time_scale(time_scale)
+    require_time_scale(time_scale)
     arm = Mg400Emulator(host=host, port_offset=port_offset, faults=faults, firmware=firmware, lenient=lenient, time_scale=time_scale)
     run_until_signal(arm, lambda: f"mg400 {host} {' '.join(str(port) for port in arm.ports.values())}")
 
 
 def emulate_magician(*, link: Path | None = None, faults: tuple[str, ...] = (), time_scale: float = 1.0) -> None:
     """Emulate a Dobot Magician on a pseudo-terminal until it is ended; see ``MagicianEmulator``."""
-    _require_time_scale(time_scale)
+    require_time_scale(time_scale)
     arm = MagicianEmulator(link=link, faults=faults, time_scale=time_scale)
     run_until_signal(arm, lambda: f"magician {link or arm.device}")
 
 
-def _require_time_scale(time_scale: float) -> None:
+def require_time_scale(time_scale: float) -> None:
+    """Raise ``DeviceError`` unless an emulated arm can be this many times as fast as the real one."""
     if not SLOWEST <= time_scale <= FASTEST:
         raise DeviceError(f"`time_scale` {time_scale:g}: expected {SLOWEST:g} to {FASTEST:g} times the real arm's speed")
 

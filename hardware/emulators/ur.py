@@ -24,9 +24,9 @@ from hardware.arms.kinematics import Violation
 from hardware.arms.motion import MotionTrack, Speeds
 from hardware.arms.ur.driver import EMERGENCY, IDLE, NORMAL, PAUSED, PLAYING, POWER_OFF, PROTECTIVE, RUNNING, STOPPED
 from hardware.arms.ur.kinematics import UrKinematics, pose_from_ur, pose_to_ur
-from hardware.emulators.faults import SECONDS, SHARE, Emulator, Fault, Faults, Range
-from hardware.emulators.running import FASTEST, SLOWEST, run_until_signal
-from hardware.errors import DeviceError, cannot_listen
+from hardware.emulators.faults import SECONDS, SHARE, Emulator, Fault, Faults
+from hardware.emulators.running import require_time_scale, run_until_signal
+from hardware.errors import cannot_listen
 
 LOG = logging.getLogger(__name__)
 DASHBOARD_PORT, SCRIPT_PORT, RTDE_PORT = 29999, 30003, 30004
@@ -230,8 +230,7 @@ class UrEmulator(Emulator):
     """
 
     def __init__(self, *, host: str | None = "127.0.0.1", faults: tuple[str, ...] = (), time_scale: float = 1.0) -> None:
-        if time_scale not in (allowed := Range(SLOWEST, FASTEST)):
-            raise DeviceError(f"`time_scale` {time_scale:g}: expected {allowed}")
+        require_time_scale(time_scale)
         self.faults = Faults(FAULTS, faults)
         self.arm = UrController(self.faults, time_scale)
         self.host = host or f"127.{random.randrange(1, 255)}.{random.randrange(256)}.{random.randrange(1, 255)}"

@@ -16,7 +16,7 @@ import numpy as np
 
 from hardware.arms.arm import Arm, ArmState
 from hardware.arms.mg400 import MG400
-from hardware.cameras.source import FrameSource
+from hardware.cameras.source import FrameSource, no_frame
 from hardware.errors import DeviceError
 from hardware.safety.eyes import ArmWatch, FreshFrames
 from hardware.safety.safe_arm import SafeArm, try_each
@@ -151,10 +151,8 @@ def run_gripper(
         stack.enter_context(eyes.watching())
         asked_s = valid_s = time.monotonic()
         while len(found) < steps:
-            try:
+            with no_frame():
                 frames = {name: watch.frame_after(source, asked_s, timeout_s=timeout_s) for name, source in rig.sources.items()}
-            except TimeoutError as error:
-                raise DeviceError(f"{error}; check the camera") from error
             pins = {name: pipelines[name](frame) for name, frame in frames.items()}
             asked_s = time.monotonic()
             if reasons := [f"{name}: {each.reason}" for name, each in pins.items() if not each.valid]:

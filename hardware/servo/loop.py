@@ -12,6 +12,7 @@ from enum import StrEnum
 import numpy as np
 
 from hardware.arms.arm import ArmState
+from hardware.cameras.source import no_frame
 from hardware.errors import DeviceError, StaleDataError
 from hardware.rig.last_axis import HOLD_DEG
 from hardware.safety.decide import DecisionCode, Sensed
@@ -129,7 +130,7 @@ class ServoLoop:
         with self._watch.doing("moving clear of the object"):
             self.mover.go_around(self.mover.away_from(start_pose))
         if self.hooks.take_rest is not None:
-            with ErrorsAs((TimeoutError, EOFError), lambda error: DeviceError(f"{error}; check the camera")):
+            with no_frame():
                 rest = self._exposed_after(self.mover.state().time_s)
             self.estimator = self.hooks.take_rest(rest)
 

@@ -61,9 +61,14 @@ class CarriedSensor:
             data.mocap_quat[0] = turns(share).as_quat(scalar_first=True)
             self.scene.step()
         self._last = T, time_s
-        if lost := self.scene.read(CARRIED).lost:
-            raise ContactError(lost)
-        return self.scene.pins(CARRIED)
+        return pins_at(self.scene, CARRIED)
+
+
+def pins_at(scene: TactileScene, site: str) -> PinState:
+    """A sensor's pins; ``ContactError`` if its contact can't be computed."""
+    if lost := scene.read(site).lost:
+        raise ContactError(lost)
+    return scene.pins(site)
 
 
 def open_world(scene: str, sensor: SensorSpec, T_tool_sensor: np.ndarray) -> CarriedSensor:
@@ -126,9 +131,7 @@ class SceneGripper:
             passed_s = float(np.clip(time_s - self._last_s, 0.0, LONGEST_S))
             self.scene.step(round(passed_s / self.scene.model.opt.timestep))
             self._last_s = max(self._last_s, time_s)
-            if lost := self.scene.read(site).lost:
-                raise ContactError(lost)
-            return self.scene.pins(site)
+            return pins_at(self.scene, site)
 
 
 @dataclass(frozen=True)

@@ -200,17 +200,22 @@ def tap_and_shear(pose: ObjectPose) -> Way:
     return [(at_s, replace(pose, x_mm=shear, y_mm=0.0, depth_mm=depth)) for at_s, depth, shear in moves]
 
 
-def next_path(folder: Path, stem: str, suffix: str) -> Path:
-    """A path ``STEM-NUMBER`` in a folder that is not in use yet. The folder is made if it does not exist.
+def make_folder(folder: Path) -> Path:
+    """The folder, which is made if it does not exist.
 
     Raises
     ------
     TwinError
-        The folder can't be made.
+        It can't be made.
     """
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def next_path(folder: Path, stem: str, suffix: str) -> Path:
+    """A path ``STEM-NUMBER`` in a folder that is not in use yet; see ``make_folder``."""
     number = 1
-    while (path := folder / f"{stem}-{number}{suffix}").exists():
+    while (path := make_folder(folder) / f"{stem}-{number}{suffix}").exists():
         number += 1
     return path

@@ -24,7 +24,7 @@ from twin.studio.page import LineChart, StudioPage, put, value_of
 from twin.studio.pictures import OverlayChoices, badge, estimate_table, number_table, paragraph, pins_found
 from twin.studio.pose import LIMITS, NAMES, ObjectPose, PressedPose, readable_name, unit_of
 from twin.studio.scene import FULL_SCALE, PinColour, Scene
-from twin.studio.state import LAST_STATE, StudioState, Way, heading, next_path, read_trajectory, save_trajectory, tap_and_shear
+from twin.studio.state import LAST_STATE, StudioState, Way, heading, make_folder, next_path, read_trajectory, save_trajectory, tap_and_shear
 from twin.studio.tracing import Tracer
 from twin.studio.video import FilmWriter
 from twin.studio.worker import Worker
@@ -421,8 +421,7 @@ class TwinMode(PageMode):
             self._load_rest()
         if answer.arrived and self._kept != self.state:
             self._kept = self.state
-            self._out.mkdir(parents=True, exist_ok=True)
-            self._kept.save(self._out / LAST_STATE)
+            self._kept.save(make_folder(self._out) / LAST_STATE)
         for follow in self.followers:
             follow(answer)
 

@@ -15,7 +15,7 @@ from twin.pins.pipeline import Pipeline
 from twin.progress import Progress, silent, stage
 from twin.report.charts import save_figure
 from twin.report.plots import ObservedFrame, contact_panel
-from twin.report.skin3d import displaced_skin, draw_contact_skin, write_surface
+from twin.report.skin3d import SkinPainter, displaced_skin, write_surface
 from twin.report.table import force_interval
 from twin.simulator import RenderedFrame, Simulator
 from twin.store import made_by, write_json, write_npz, writes
@@ -96,19 +96,24 @@ def render_contact(
     """
     simulator = Simulator(sensor, quality=quality)
     simulator.check_form(form)
-    with stage(progress, f"press {obj.name}") as step:
-        state = simulator.press(obj, pose, progress=step)
-    with stage(progress, "render"):
-        rendered = simulator.render(state, form=form, seed=seed)
-    with stage(progress, "pictures"):
-        written, look = write_contact(out, simulator, obj, pose, state, rendered)
+    with SkinPainter() as painter:
+        with stage(progress, f"press {obj.name}") as step:
+            state = simulator.press(obj, pose, progress=step)
+        painter.draw_contact(simulator.solver.mesh, sensor.pins, state, build_field(obj))
+        with stage(progress, "render"):
+            rendered = simulator.render(state, form=form, seed=seed)
+        with stage(progress, "pictures"):
+            written, look = write_contact(out, simulator, obj, pose, state, rendered, painter)
     return RenderedContact(state, rendered, look, written, sensor.skin.stiffness_factor)
 
 
 def write_contact(
-    out: Path, simulator: Simulator, obj: ObjectSpec, pose: Pose, state: ContactState, rendered: RenderedFrame
+    out: Path, simulator: Simulator, obj: ObjectSpec, pose: Pose, state: ContactState, rendered: RenderedFrame, painter: SkinPainter
 ) -> tuple[list[Path], ObservedFrame]:
-    """Write all files of one contact into a folder. Returns the files, and what the pipeline sees in the picture."""
+    """Write all files of one contact into a folder. Returns the files, and what the pipeline sees in the picture.
+
+    ``painter`` has begun to draw the contact.
+    """
     spec = simulator.spec
     write_image(out / "frame.png", rendered.frame.image)
     write_exr(out / "frame.exr", rendered.linear, simulator.renderer.choice)
@@ -116,10 +121,9 @@ def write_contact(
     record = contact_record(simulator, obj, pose, state, rendered)
     write_json(out / "truth.json", record | {"made_by": made_by(Simulator, inputs=[spec, obj, pose])})
 
-    mesh = simulator.solver.mesh
-    write_surface(out / "skin.vtp", displaced_skin(mesh, state))
-    draw_contact_skin(mesh, spec.pins, state, build_field(obj), out / "skin.png")
+    write_surface(out / "skin.vtp", displaced_skin(simulator.solver.mesh, state))
     look = look_at(simulator, rendered)
+    painter.save(out / "skin.png")
     title = f"{spec.name} against {obj.name}, {pose.indent_mm:g} mm deep, {state.force_n[2]:.2f} N"
     save_figure(out / "panel.png", contact_panel(out / "skin.png", look, title), dpi=110)
     return [out / name for name in FILES], look

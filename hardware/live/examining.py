@@ -13,8 +13,9 @@ from twin.calibration.camera_view import register_files
 from twin.errors import FrameError, OptionError
 from twin.frames import evenly_read, open_recording, spread_indices
 from twin.frames.images import write_image
-from twin.pins import DetectorSpec, Finding, Grade, Pipeline, examine, with_detector
+from twin.pins import DetectorSpec, Pipeline, with_detector
 from twin.pins.batch import draw_overlay
+from twin.pins.check import Finding, Grade, examine
 from twin.progress import Progress, silent, stage
 from twin.report.page import Page, PagePicture
 from twin.report.table import Cell

@@ -13,7 +13,8 @@ from twin.evaluation.degradation.study import consensus
 from twin.evaluation.degradation.sweep import SweepSettings, run_sweep
 from twin.frames import open_recording
 from twin.frames.images import write_image
-from twin.pins import make_detector, shipped_detector, tune
+from twin.pins import make_detector, shipped_detector
+from twin.pins.detectors.tune import tune
 from twin.pins.labelling.reference import nominal_reference
 from twin.types import Form
 

@@ -7,7 +7,7 @@ from scenes import load_sensor
 from training.studies.contact_check import contact_finding
 from twin.errors import TwinError
 from twin.frames import evenly_read, open_recording
-from twin.pins import Grade
+from twin.pins.check import Grade
 from twin.types import Form, Frame
 
 

@@ -16,9 +16,10 @@ from twin.evaluation.degradation.conditions.skin import faded, missing, pale
 from twin.frames.forms import is_two_level
 from twin.optics.preview import Preview
 from twin.optics.surfaces import cap_albedo
-from twin.pins import Grade, Pipeline, examine, tune
+from twin.pins import Pipeline
+from twin.pins.check import Grade, examine
 from twin.pins.detectors.legacy import LegacyPipeline
-from twin.pins.detectors.tune import _at_rest
+from twin.pins.detectors.tune import _at_rest, tune
 from twin.pins.finding.caps import measure_caps
 from twin.pins.labelling.identify import LayoutInFrame, _at_likelier_spots, identify, score_layout
 from twin.pins.labelling.matching import match

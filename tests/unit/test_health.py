@@ -18,8 +18,8 @@ from twin.frames.forms import blob_spec, frame_size
 from twin.frames.images import write_image
 from twin.geometry.pins import rest_pins
 from twin.mechanics.path import ContactPose
-from twin.pins import DetectorSpec, Grade, examine
-from twin.pins.check import drift_of
+from twin.pins import DetectorSpec
+from twin.pins.check import Grade, drift_of, examine
 from twin.pins.labelling.reference import nominal_reference
 from twin.types import Form, Frame
 

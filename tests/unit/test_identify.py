@@ -9,7 +9,7 @@ from scenes import load_sensor
 from scenes.pins import PinsSpec
 from twin.errors import FrameError
 from twin.geometry.pins import pin_lattice
-from twin.pins import tune
+from twin.pins.detectors.tune import tune
 from twin.pins.finding.bumps import find_bumps
 from twin.pins.labelling.identify import _match_known, identify, score_layout, symmetries
 from twin.types import Form, Frame

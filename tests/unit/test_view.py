@@ -21,7 +21,8 @@ from twin.geometry.pins import namings, pin_lattice, rest_pins
 from twin.geometry.solid import Resolution
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
-from twin.pins import Grade, Pipeline, examine, make_reference, measure_reference, nominal_reference, view_of
+from twin.pins import Pipeline, make_reference, measure_reference, nominal_reference, view_of
+from twin.pins.check import Grade, examine
 from twin.pins.labelling.identify import symmetries
 from twin.pins.labelling.view import MOST_TURN_DEG
 from twin.rig.labels import read_arm_labels

@@ -20,7 +20,9 @@ def test_a_vtk_that_is_killed_gives_a_plain_picture_and_a_reason(tmp_path, monke
     monkeypatch.setattr(skin3d.sys, "executable", str(dying))
     skin = pv.Sphere()
     skin["displacement_mm"] = np.linspace(0, 1, skin.n_points)
-    reason = skin3d.draw_skin(skin, pv.Sphere(), pv.Sphere(center=(0, 0, 1)), tmp_path / "skin.png")
+    with skin3d.SkinPainter() as painter:
+        painter.draw(skin, pv.Sphere(), pv.Sphere(center=(0, 0, 1)))
+        reason = painter.save(tmp_path / "skin.png")
     assert "libegl1" in reason
     assert cv2.imread(str(tmp_path / "skin.png")) is not None
 

@@ -22,10 +22,11 @@ from twin.errors import FrameError, OptionError, TwinError
 from twin.frames import frames_at, open_recording
 from twin.geometry.pins import pin_lattice, rest_pins, usual_spacing
 from twin.optics.relief import cap_planes
-from twin.pins import Grade, Pipeline, examine, nominal_reference, tune, with_detector
+from twin.pins import Pipeline, nominal_reference, with_detector
 from twin.pins.batch import recording_reference
+from twin.pins.check import Grade, examine
 from twin.pins.detectors.detector_spec import shipped_detector
-from twin.pins.detectors.tune import _at_rest
+from twin.pins.detectors.tune import _at_rest, tune
 from twin.pins.labelling.identify import Candidate, LayoutInFrame
 from twin.pins.labelling.rest import Rest, rest_from_contacts
 from twin.pins.labelling.rest import rest_of as rest_found

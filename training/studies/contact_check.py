@@ -4,7 +4,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from scenes.sensor import SensorSpec
-from twin.pins import Finding, Grade
+from twin.pins.check import Finding, Grade
 from twin.types import Frame
 
 MOST_STRANGE = 0.5

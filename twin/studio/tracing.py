@@ -18,8 +18,10 @@ from pathlib import Path
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.errors import RenderError, TwinError
+from twin.objects import build_field
 from twin.optics.preview import Shading
 from twin.optics.render import Renderer
+from twin.report.skin3d import SkinPainter
 from twin.simulator import Simulator
 from twin.studio.camera import PARTS, dome_renderer, dome_shading
 from twin.studio.pose import PressedPose
@@ -240,8 +242,10 @@ class _Maker:
 
         if self._simulator is None:
             self._simulator = Simulator(self._spec)
-        rendered = self._simulator.render(job.state, form=job.form)
-        yield Saved(write_contact(job.out, self._simulator, job.obj, job.pose, job.state, rendered)[0])
+        with SkinPainter() as painter:
+            painter.draw_contact(self._simulator.solver.mesh, self._spec.pins, job.state, build_field(job.obj))
+            rendered = self._simulator.render(job.state, form=job.form)
+            yield Saved(write_contact(job.out, self._simulator, job.obj, job.pose, job.state, rendered, painter)[0])
 
 
 def _catch_render_errors(make: Callable[[], Iterator[Outcome]], *, tracing: bool = False) -> Iterator[Outcome]:

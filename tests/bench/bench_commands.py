@@ -1,12 +1,11 @@
 """Time commands of this release beside those of an earlier commit, cold and warm, and data sets by two processes beside one.
 
-Run: PYTHONPATH=. python tests/bench/bench_commands.py [--against ec452a2] [--repeats 3] [--out out/bench]. Both run in this environment,
+Run: PYTHONPATH=. python tests/bench/bench_commands.py [--against ec452a2] [--repeats 3]. Both run in this environment,
 each from its own tree of files, one command after the other. *Cold*: no compiled function lies anywhere; *warm*: the best of the
 repeats.
 """
 
 import argparse
-import json
 import os
 import shutil
 import subprocess
@@ -25,6 +24,8 @@ FAST = {True: "rasterised", False: "drawn"}
 """Name of the quality in this release, and in the earlier."""
 START = "from twin.cli import main; main()"
 CONTACTS, FRAMES = 40, 100
+AGAINST, REPEATS = "ec452a2", 3
+"""Version 1.0.0, and runs of each warm command."""
 
 
 def seconds(tree, line, *, caches):
@@ -57,35 +58,35 @@ def compare(trees, work, repeats):
 
 
 def share_work(trees, work):
-    """Seconds of a data set by one process and by two: dict of (name, how) to [present, earlier]."""
+    """Seconds of a data set by one process and by two, warm: dict of (name, how) to [present, earlier]."""
     found = {}
-    for count in (1, 2):
+    for count, name in ((1, "first"), (1, "1 worker"), (2, "2 workers")):
         pair = []
         for tree in trees:
             out = work / "shared"
             shutil.rmtree(out, ignore_errors=True)
-            pair.append(
-                seconds(tree, f"dataset {DATA} --count {CONTACTS} --workers {count} --out {out}", caches=work / f"caches-{tree.name}")
-            )
-        found["dataset", f"{count} workers"] = pair
-    return found
+            line = f"dataset {DATA} --count {CONTACTS} --workers {count} --out {out}"
+            pair.append(seconds(tree, line, caches=work / f"caches-{tree.name}"))
+        found["dataset", name] = pair
+    return {key: pair for key, pair in found.items() if key[1] != "first"}
+
+
+def measure(against, repeats):
+    """The table of all commands, beside those of a commit: dict of (name, how) to [present, earlier], s."""
+    with tempfile.TemporaryDirectory() as folder:
+        earlier = Path(folder) / "earlier"
+        subprocess.run(["git", "-C", str(ROOT), "worktree", "add", "--quiet", "--detach", str(earlier), against], check=True)
+        try:
+            trees = (ROOT, earlier)
+            return compare(trees, Path(folder), repeats) | share_work(trees, Path(folder))
+        finally:
+            subprocess.run(["git", "-C", str(ROOT), "worktree", "remove", "--force", str(earlier)], check=True)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--against", default="ec452a2", help="commit of the earlier release")
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--out", type=Path, default=Path("out/bench"))
+    parser.add_argument("--against", default=AGAINST, help="commit of the earlier release")
+    parser.add_argument("--repeats", type=int, default=REPEATS)
     given = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        earlier = Path(folder) / "earlier"
-        subprocess.run(["git", "-C", str(ROOT), "worktree", "add", "--quiet", "--detach", str(earlier), given.against], check=True)
-        try:
-            trees = (ROOT, earlier)
-            table = compare(trees, Path(folder), given.repeats) | share_work(trees, Path(folder))
-        finally:
-            subprocess.run(["git", "-C", str(ROOT), "worktree", "remove", "--force", str(earlier)], check=True)
-    for (name, how), (present, before) in table.items():
+    for (name, how), (present, before) in measure(given.against, given.repeats).items():
         print(f"{name:12}{how:12}{present:7.2f} s, earlier {before:7.2f} s, ratio {present / before:.2f}")
-    given.out.mkdir(parents=True, exist_ok=True)
-    (given.out / "commands.json").write_text(json.dumps({f"{name} {how}": pair for (name, how), pair in table.items()}, indent=1))

@@ -1,5 +1,7 @@
 """``tactip/GraspLift-v0`` and ``tactip/PegInsert-v0``: a constant grip, scripted controllers, and what PPO learns without and with touch.
 
+With pins PPO sees the linear part of their displacement (``PinModes``): a displacement of all pins shows the load, and a spread the grip.
+
 Run: PYTHONPATH=. python tests/bench/bench_grasp.py [--way ppo] [--observation pins] [--seed 0] [--steps 100000] [--out FILE]. It prints
 the share of 100 new episodes that are solved, each with the policy's mean action. PPO is that of stable-baselines3 with 8 environments
 and ``SETTINGS`` for all observations; rewards are divided by their running standard deviation (``VecNormalize``).
@@ -22,6 +24,7 @@ from bench_baselines import ENVIRONMENTS, EPISODES, JUDGED_FROM, Curve  # noqa: 
 from peg_expert import Expert  # noqa: E402
 from stable_baselines3 import PPO  # noqa: E402
 from stable_baselines3.common.env_util import make_vec_env  # noqa: E402
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor  # noqa: E402
 from stable_baselines3.common.vec_env import VecNormalize  # noqa: E402
 
 import training.environments  # noqa: E402, F401
@@ -38,10 +41,27 @@ SETTINGS = {
     "policy_kwargs": {"log_std_init": -1.0},
 }
 """What differs from PPO's default settings."""
+MODE_SCALE = 8.0
+"""Factor that makes the modes of the pins about as large as the wrenches in N."""
 N_PER_ACTION = 0.15
 """Change of the force by an action of 1, about."""
 LEAST_N, PER_LOAD = 0.45, 2.5
 """Grip at the start, and per load at each finger, of the controller that feels the load."""
+
+
+class PinModes(BaseFeaturesExtractor):
+    """State, and for each sensor the coefficients of the linear function of place that is nearest to the pins' displacements."""
+
+    def __init__(self, space, rest_px):
+        at = (rest_px - rest_px.mean(axis=0)) / np.ptp(rest_px, axis=0).max()
+        basis = np.linalg.qr(np.column_stack([np.ones(len(at)), at]))[0] / np.sqrt(len(at))
+        moved = space["tactile"].shape
+        super().__init__(space, space["state"].shape[0] + moved[0] * moved[1] * moved[3] * basis.shape[1])
+        self.register_buffer("basis", torch.tensor(MODE_SCALE * basis, dtype=torch.float32))
+
+    def forward(self, seen):
+        modes = torch.einsum("btsnc,nk->btsck", seen["tactile"], self.basis)
+        return torch.cat([seen["state"], modes.flatten(1)], 1)
 
 
 def solved(task, controller, episodes=EPISODES, **options):

@@ -4,6 +4,7 @@ import argparse
 import sys
 
 from figures import (  # noqa: F401  (each registers its jobs)
+    commands,
     data,
     environments,
     forces,

@@ -35,6 +35,11 @@ class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
     render_mode : {None, "rgb_array"}
         ``render`` then shows the scene.
 
+    Attributes
+    ----------
+    rest_px : list of (N, 2) float
+        Places of each sensor's pins without contact, px of its frames.
+
     Raises
     ------
     OptionError
@@ -62,10 +67,10 @@ class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
         self._geom = self._model.geom(self.held).id
         self._object = int(self._model.geom_bodyid[self._geom])
         self._inertia = self._model.body_inertia[self._object] / self._model.body_mass[self._object]
-        self._rest_px = [self.scene.read(site).pins_px for site in sensors]
-        self._spacing = float(np.median(np.linalg.norm(np.diff(self._rest_px[0], axis=0), axis=1)))
+        self.rest_px = [self.scene.read(site).pins_px for site in sensors]
+        self._spacing = float(np.median(np.linalg.norm(np.diff(self.rest_px[0], axis=0), axis=1)))
         self._renderer: mujoco.Renderer | None = None
-        shapes = {"pins": (2, 2, *self._rest_px[0].shape), "wrench": (2, 2, 6)}
+        shapes = {"pins": (2, 2, *self.rest_px[0].shape), "wrench": (2, 2, 6)}
         box: dict[str, spaces.Space[Any]] = {"state": spaces.Box(-10.0, 10.0, self.shape[:1], np.float32)}
         if observation in shapes:
             box["tactile"] = spaces.Box(-10.0, 10.0, shapes[observation], np.float32)
@@ -101,7 +106,7 @@ class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
             self.scene.step()
         self.felt = [self.scene.read(site) for site in self.scene.sensors]
         if self.observation == "pins":
-            touch = np.stack([of.pins_px - rest for of, rest in zip(self.felt, self._rest_px, strict=True)]) / self._spacing
+            touch = np.stack([of.pins_px - rest for of, rest in zip(self.felt, self.rest_px, strict=True)]) / self._spacing
         else:
             touch = np.stack([np.concatenate([of.force_n, of.torque_nmm / 10.0]) for of in self.felt])
         before = touch if self._touch is None else self._touch[0]

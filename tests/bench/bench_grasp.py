@@ -1,10 +1,11 @@
 """``tactip/GraspLift-v0`` and ``tactip/PegInsert-v0``: a constant grip, scripted controllers, and what PPO learns without and with touch.
 
 With pins PPO sees the linear part of their displacement (``PinModes``): a displacement of all pins shows the load, and a spread the grip.
+Its learning rate then falls to zero.
 
 Run: PYTHONPATH=. python tests/bench/bench_grasp.py [--way ppo] [--observation pins] [--seed 0] [--steps 100000] [--out FILE]. It prints
 the share of 100 new episodes that are solved, each with the policy's mean action. PPO is that of stable-baselines3 with 8 environments
-and ``SETTINGS`` for all observations; rewards are divided by their running standard deviation (``VecNormalize``).
+and ``SETTINGS``; rewards are divided by their running standard deviation (``VecNormalize``).
 """
 
 import argparse
@@ -41,6 +42,8 @@ SETTINGS = {
     "policy_kwargs": {"log_std_init": -1.0},
 }
 """What differs from PPO's default settings."""
+PINS_RATE = 1.5e-3
+"""Learning rate with pins at the start."""
 MODE_SCALE = 8.0
 """Factor that makes the modes of the pins about as large as the wrenches in N."""
 N_PER_ACTION = 0.15
@@ -108,13 +111,19 @@ SCRIPTED = {"expert": ("GraspLift", grip_with(knowing)), "load": ("GraspLift", g
 """Tasks and controllers by name."""
 
 
+def pin_settings(env):
+    """The settings with pins."""
+    extractor = {"features_extractor_class": PinModes, "features_extractor_kwargs": {"rest_px": env.get_attr("rest_px")[0][0]}}
+    return SETTINGS | {"learning_rate": lambda left: PINS_RATE * left, "policy_kwargs": SETTINGS["policy_kwargs"] | extractor}
+
+
 def learnt(observation, seed, steps=STEPS, out=None):
     """The share that PPO solves, its steps, and the seconds of processor time that it took to learn."""
     torch.set_num_threads(1)
     given = {"env_kwargs": {"observation": observation}, "monitor_kwargs": {"info_keywords": ("is_success",)}}
     env, used = make_vec_env("tactip/GraspLift-v0", ENVIRONMENTS, seed=seed, **given), process_time()
     env = VecNormalize(env, norm_obs=False, gamma=SETTINGS["gamma"])
-    learner = PPO("MultiInputPolicy", env, seed=seed, device="cpu", **SETTINGS)
+    learner = PPO("MultiInputPolicy", env, seed=seed, device="cpu", **(pin_settings(env) if observation == "pins" else SETTINGS))
     learner.learn(steps, callback=Curve())
     used = process_time() - used
     if out:

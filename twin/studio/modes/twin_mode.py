@@ -470,7 +470,7 @@ class TwinMode(PageMode):
             "its size, 90 % interval": f"{ends[0]:.2f} to {ends[1]:.2f} N",
             "lateral, share of normal": f"{across:.2f} N, {across / into:.2f}" if into > 0.01 else "-",
             "torque about z": f"{torque:+.1f} N mm",
-            "indentation": f"{answer.indent_mm:+.2f} mm",
+            "indentation, positive in contact": f"{answer.indent_mm:+.2f} mm",
             "contact area, slipping": f"{state.area_mm2:.0f} mm2, {100 * state.slip_share:.0f} %",
             "pins found": pins_found(seen),
         }
@@ -533,7 +533,7 @@ class TwinMode(PageMode):
         way, self._path = self._path, None
         if way:
             kept = [pair for k, pair in enumerate(way) if k == 0 or pair[0] > way[k - 1][0]]
-            self._page.say(f"saved {save_trajectory(next_path(self._out, 'trajectory', '.csv'), kept)} ({len(kept)} poses)")
+            self._page.say(f"saved {save_trajectory(next_path(self._out, 'trajectory', '.csv'), kept)} (poses: {len(kept)})")
 
     def _toggle_film(self) -> None:
         if self._filming.value:

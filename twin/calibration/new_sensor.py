@@ -622,8 +622,10 @@ def _write_page(path: Path, made: NewSensor, pictures: list[Path]) -> None:
     )
     page.section("How to find out more")
     page.items(made.next_steps)
-    page.section("Pins in the frames", "Green: found. Red: a lost pin's expected place. Yellow: spots that are no pins.")
-    page.figures(*(PagePicture(path, f"Frame with its pins, {path.stem}", "", kind="photo") for path in pictures), layout="row")
+    page.section(
+        "Pins in the frames", "Green: found, with the pin's number. Red: a lost pin's expected place. Yellow: spots that are no pins."
+    )
+    page.figures(*(PagePicture(path, f"Frame with its pins, {path.stem}", "", kind="photo") for path in pictures))
     page.section("Layouts that were considered")
     page.table(
         [

@@ -470,7 +470,7 @@ class TwinMode(PageMode):
             "its size, 90 % interval": f"{ends[0]:.2f} to {ends[1]:.2f} N",
             "lateral, share of normal": f"{across:.2f} N, {across / into:.2f}" if into > 0.01 else "-",
             "torque about z": f"{torque:+.1f} N mm",
-            "indentation, positive in contact": f"{answer.indent_mm:+.2f} mm",
+            "indentation": f"{answer.indent_mm:+.2f} mm",
             "contact area, slipping": f"{state.area_mm2:.0f} mm2, {100 * state.slip_share:.0f} %",
             "pins found": pins_found(seen),
         }

@@ -17,6 +17,8 @@ from scenes.rig import RigSpec
 
 Polarity = Literal["bright", "dark"]
 """Whether caps are brighter or darker than the skin around them."""
+UNSURE_LAYOUT = "The layout of the pins is unsure"
+"""Sentence in the description of a specification that was made from frames which do not decide the layout."""
 ELSEWHERE = "leave it out if it was measured on another layout"
 """Remedy in the error for measured values of caps that do not fit the layout."""
 

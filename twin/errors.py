@@ -12,6 +12,12 @@ from typing import Generic, TypeVar
 E = TypeVar("E", bound=Exception)
 
 
+def format_count(count: int, things: str) -> str:
+    """A number of things in words: '3 rows of pins', '1 row of pins'. The first word of ``things`` is a plural that ends with s."""
+    noun, space, rest = things.partition(" ")
+    return f"{count} {noun.removesuffix('s') if count == 1 else noun}{space}{rest}"
+
+
 class TwinError(Exception):
     """Base class of this program's own errors. The message states what was expected, what was found, and what to do."""
 

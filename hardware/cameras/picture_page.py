@@ -6,7 +6,6 @@ import time
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
-import cv2
 import numpy as np
 
 from hardware.cameras.coded import CONTENT_TYPE, jpeg_of, write_part
@@ -19,10 +18,13 @@ HELD_BYTES = 16_384
 """Bytes in the send buffer of a connection, so that a client that pauses gets few old pictures, and then the newest. The kernel doubles the
 number, and the client has its own buffer."""
 STREAM = "/stream.mjpg"
-PAGE = f"""<!doctype html><meta name=viewport content="width=device-width"><title>Camera</title>
-<body style="margin:0;background:#222;text-align:center"><img src="{STREAM}" style="max-width:100%" alt="the camera's picture">"""
-LINE_PX, LETTER = 28, 0.6
-"""Height of the line of text, px, and size of its letters, for OpenCV."""
+LINE = "/line"
+PAGE = f"""<!doctype html><meta charset=utf-8><meta name=viewport content="width=device-width,initial-scale=1"><title>Camera</title>
+<body style="margin:0;background:#222;color:#fff;text-align:center;font:1.4rem sans-serif">
+<p id=line role=status style="margin:.5rem;min-height:2.4em"></p>
+<img src="{STREAM}" style="width:100%;height:calc(100vh - 5rem);object-fit:contain;object-position:top" alt="the camera's picture">
+<script>setInterval(async () => {{ try {{ line.textContent = await (await fetch("{LINE}")).text() }}
+catch {{ line.textContent = "The recording has ended." }} }}, 250)</script>"""
 
 
 @dataclass(frozen=True)
@@ -49,12 +51,14 @@ class JpegServer(ThreadingHTTPServer):
     Attributes
     ----------
     page : str
-        Page at every address but that of the stream; "" if the stream is at all addresses.
+        Page at every address but those of the stream and the line; "" if the stream is at all addresses.
+    line : str
+        The page's line of text.
     url : str
         Address of the page, or of the server.
     """
 
-    page = ""
+    page, line = "", ""
 
     def __init__(self, who: str, host: str, port: int) -> None:
         with ErrorsAs(OSError, lambda error: cannot_listen(who, host, port, error)):
@@ -117,10 +121,8 @@ class PicturePage(JpegServer):
 
     def show(self, image: np.ndarray, line: str) -> None:
         """Show a picture (H, W) or (H, W, 3), RGB, with a line of text."""
-        text = np.zeros((LINE_PX, max(image.shape[1], 1), 3), np.uint8)
-        cv2.putText(text, line, (6, LINE_PX - 9), cv2.FONT_HERSHEY_SIMPLEX, LETTER, (255, 255, 255), 1, cv2.LINE_AA)
-        coloured = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
-        self.give(StreamPart(self.newest.number + 1, jpeg_of(np.vstack([text, coloured]))))
+        self.line = line
+        self.give(StreamPart(self.newest.number + 1, jpeg_of(image)))
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -138,7 +140,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, HELD_BYTES)
         self.do_HEAD()
         if not self._streams:
-            self.wfile.write(self.server.page.encode())
+            self.wfile.write((self.server.line if self.path == LINE else self.server.page).encode())
             return
         number = 0
         while not (self.server.ended.is_set() or self.server.refuses()):

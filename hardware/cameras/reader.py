@@ -153,11 +153,11 @@ class LiveSource(Connection):
             spent = f"{sum(outages_s):.1f} s in all, the longest {max(outages_s):.1f} s: no new picture came"
             found.append(f"{len(outages_s)} {'outage' if len(outages_s) == 1 else 'outages'} of the camera, {spent}")
         if self.lost:
-            found.append(f"{self.lost} pictures were lost before they arrived: the camera's numbers have gaps")
+            found.append(f"pictures lost before they arrived: {self.lost}; the camera's numbers have gaps")
         if self.reopened:
             found.append(f"the camera was opened again {self.reopened} {'time' if self.reopened == 1 else 'times'}")
         if torn:
-            found.append(f"{len(torn)} pictures arrived incomplete or damaged and were left out; the last: {torn[-1]}")
+            found.append(f"pictures left out, incomplete or damaged: {len(torn)}; the last: {torn[-1]}")
         if self._repeated:
             found.append(f"{self._repeated} of {self.arrived} pictures repeat the one before them")
         return found

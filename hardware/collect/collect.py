@@ -29,7 +29,7 @@ from hardware.workcell.mover import Mover
 from scenes import ObjectSpec, SensorSpec, ServoSpec
 from scenes.experiment import LABELS, ExperimentSpec
 from scenes.files import quote
-from twin.errors import ErrorsAs, FrameError
+from twin.errors import ErrorsAs, FrameError, format_count
 from twin.frames.folders import pictures_folder
 from twin.frames.images import write_image
 from twin.pins import Pipeline, measure_reference
@@ -425,7 +425,7 @@ class Collected:
 
     def lines(self) -> list[str]:
         """The result as lines of text."""
-        return [f"{self.count} contacts in {self.folder} ({self.count - self.before} new)"]
+        return [f"{format_count(self.count, 'contacts')} in {self.folder} ({self.count - self.before} new)"]
 
 
 @writes("images", "frames_bw", gone_on=(TABLE, META, LOG))

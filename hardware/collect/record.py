@@ -32,7 +32,7 @@ OTHER, OTHER_LEVELS = 4.0, 0.4
 SHRINK = 4
 """Frames are compared at this fraction of their size."""
 PATIENCE_S, GIVE_UP_S = 15.0, 60.0
-"""Time after which a picture with a fault is kept nevertheless, and after which no more contacts are expected."""
+"""Time after which a picture with a fault is kept nevertheless, and the user reminded; and after which no more contacts are expected."""
 WHITE, MOST_WHITE = 250, 0.3
 """Gray level of a saturated pixel, and the largest share of them. The housing may be white."""
 DARKEST = 40
@@ -53,7 +53,7 @@ class RecordedFrames(ReadableResult):
 
     def lines(self) -> list[str]:
         """The result as lines of text."""
-        wrote = f"wrote {self.count} frames in contact, and init_0.png without contact, into {self.folder}"
+        wrote = f"wrote contacts ({self.count}), and init_0.png without contact, into {self.folder}"
         return [wrote, *(f"note: {note}" for note in self.notes), f"next: twin new {self.folder} --out MY.toml"]
 
 
@@ -93,7 +93,7 @@ def record_frames(
         page = opened.enter_context(PicturePage(port))
         say(f"the camera's picture is on {page.url}")
         opened.enter_context(source)
-        chosen, done = _Chosen(), 0
+        chosen, done, reminded = _Chosen(), 0, -1
         with stage(progress, "contacts") as step:
             while len(chosen.kept) <= count:
                 frame = await_frame(source)
@@ -104,6 +104,7 @@ def record_frames(
                     write_image(name, frame.image)
                 elif frame.time_s - chosen.since_s > GIVE_UP_S:
                     if len(chosen.kept) > ENOUGH:
+                        chosen.notes.append(f"ended at {done} of {count} contacts, after {GIVE_UP_S:.0f} s without a new one ({wish})")
                         break
                     raise DeviceError(
                         f"{out}: {done} of {count} contacts after {GIVE_UP_S:.0f} s without a new one; press the sensor at different "
@@ -111,6 +112,9 @@ def record_frames(
                     )
                 done = max(len(chosen.kept) - 1, 0)
                 page.show(frame.image, f"{done}/{count}  {wish or 'kept'}")
+                if wish and frame.time_s - chosen.since_s > PATIENCE_S and reminded < done:
+                    reminded = done
+                    say(f"{done} of {count} contacts; {wish}. Without a new one it ends in {GIVE_UP_S - PATIENCE_S:.0f} s")
                 step(done, count, wish or "kept")
     return RecordedFrames(out, done, [*chosen.notes, *source.notes()])
 

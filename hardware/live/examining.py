@@ -10,7 +10,7 @@ from hardware.cameras.choose import open_camera
 from hardware.cameras.source import await_frame
 from scenes import SensorSpec
 from twin.calibration.camera_view import register_files
-from twin.errors import FrameError, OptionError
+from twin.errors import FrameError, OptionError, format_count
 from twin.frames import evenly_read, open_recording, spread_indices
 from twin.frames.images import write_image
 from twin.pins import DetectorSpec, Pipeline, with_detector
@@ -119,7 +119,7 @@ def examine_sensor(
 def _write_page(folder: Path, found: Examination, frames: list[Frame], pipeline: Pipeline, source: str) -> None:
     tones: dict[Grade, Literal["", "good", "bad"]] = {Grade.HEALTHY: "good", Grade.FAILED: "bad"}
     counts = Counter(str(finding.verdict) for finding in found.findings)
-    lead = f"{len(frames)} frames of {source}. Checks: {', '.join(f'{count} {grade}' for grade, count in counts.items())}."
+    lead = f"{format_count(len(frames), 'frames')} of {source}. Checks: {', '.join(f'{count} {grade}' for grade, count in counts.items())}."
     page = Page(f"Health of {pipeline.spec.name}", "twin check", topic="TacTip twin: health", lead=lead)
     page.notice("What to do", [finding.remedy for finding in found.findings if finding.remedy], tone="bad" if found.failed else "")
     page.notice("Noted", found.notes)

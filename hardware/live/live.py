@@ -21,7 +21,7 @@ from hardware.live.rerun_view import RerunView
 from hardware.servo.timing import TimeSpread, Timing
 from hardware.workcell.build import load_rest_frame
 from hardware.workcell.ros2 import publishing
-from twin.errors import ErrorsAs, FrameError, OptionError, TwinError
+from twin.errors import ErrorsAs, FrameError, OptionError, TwinError, format_count
 from twin.estimate import Estimate, Estimator, SensorModel, pins_in, readable_labels
 from twin.pins import Pipeline
 from twin.records import KeptAlso
@@ -133,7 +133,7 @@ class LiveSession:
         done = list(self._done)
         now_hz = (len(done) - 1) / (done[-1] - done[0]) if len(done) > 1 and done[-1] > done[0] else 0.0
         late = f", exposure to pose {1e3 * float(np.median(self._late)):.0f} ms" if self._late else ""
-        return ["   ".join(pose), f"{now_hz:.1f} frames/s, {self.count} frames, {self.source.dropped} dropped{late}"]
+        return ["   ".join(pose), f"{now_hz:.1f} frames/s, {format_count(self.count, 'frames')}, {self.source.dropped} dropped{late}"]
 
 
 def estimate_line(estimate: Estimate) -> dict:
@@ -318,7 +318,7 @@ class WatchResult:
         if self.same is not None:
             lines.append(f"{self.same[0]} of {self.same[1]} estimates equal the recorded ones")
         if self.record is not None:
-            lines.append(f"wrote {self.record} ({self.frames} frames)")
+            lines.append(f"wrote {self.record} ({format_count(self.frames, 'frames')})")
         return lines
 
 

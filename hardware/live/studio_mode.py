@@ -20,7 +20,7 @@ from hardware.safety.eyes import FreshFrames
 from hardware.safety.safe_arm import SafeArm, try_each
 from hardware.workcell.build import check_standing
 from scenes.sensor import SensorSpec
-from twin.errors import FrameError, TwinError
+from twin.errors import FrameError, TwinError, format_count
 from twin.estimate import Estimate, SensorModel, pins_in
 from twin.pins import Pipeline
 from twin.pins.check import Grade, examine
@@ -271,7 +271,7 @@ class CameraFeed:
         if writer is None:
             return "nothing was recorded"
         writer.__exit__(None, None, None)
-        return f"wrote {writer.folder} ({writer.count} frames)"
+        return f"wrote {writer.folder} ({format_count(writer.count, 'frames')})"
 
     def _join(self) -> None:
         if self._thread is not None:
@@ -352,7 +352,8 @@ class LiveMode(PageMode):
             model = self._twin.contact.model
             if model is None:
                 raise TwinError(
-                    "no model of this sensor is loaded; wait if it still loads, or train one and start the studio with it (`model`)"
+                    "no model of this sensor is loaded: wait if it still loads. Without one the mode 'Recording' and 'twin preprocess' "
+                    "find pins and graph; for estimates run 'twin dataset' and 'twin train', and start the studio with the run (`model`)"
                 )
             if not self._camera.value.strip():
                 raise TwinError("give a camera first: a number, /dev/videoN, http://..., a folder or a video")

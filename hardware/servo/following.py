@@ -24,7 +24,7 @@ from hardware.servo.trajectory import Measures, Trajectory, comparison_figure, m
 from hardware.workcell.build import TWIN, Rig, build_rig, check_plan, load_rest_frame
 from scenes import ObjectSpec, ServoSpec, load_experiment
 from scenes.files import quote
-from twin.errors import OptionError, StoreError, TwinError
+from twin.errors import OptionError, StoreError, TwinError, format_count
 from twin.estimate import Estimate, SensorModel
 from twin.policy import KnownContacts, Policy, PolicyError, PolicyModel, load_policy
 from twin.progress import Progress, Step, silent, stage
@@ -198,14 +198,14 @@ class Followed:
         m = self.measures
         smooth = {"smoothness S": m.smoothness, "local": m.local_smoothness, "jerk in mm per step^3": m.jerk}
         out = [
-            f"{m.steps} steps on fresh frames",
+            f"{format_count(m.steps, 'steps')} on fresh frames",
             ", ".join(f"{what} {value:.3f}" for what, value in smooth.items() if np.isfinite(value)),
             *self.timing.lines(),
             *(f"note: {note}" for note in self.notes),
         ]
         if np.isfinite(m.completed):
             round_mm = np.linalg.norm(np.diff(self.outline_mm, axis=0), axis=1).sum()
-            out[0] += f", {self.path.along_mm.max():.0f} of {round_mm:.0f} mm along the outline, contact lost {m.lost_contacts:g} times"
+            out[0] += f", {self.path.along_mm.max():.0f} of {round_mm:.0f} mm along the outline, losses of contact: {m.lost_contacts:g}"
             entries = f"path error {m.path_error_mm:.3f} mm; estimates off by {m.depth_error_mm:.3f} mm, {m.angle_error_deg:.2f} deg; "
             out[2:2] = [
                 f"{entries if np.isfinite(m.path_error_mm) else ''}"  # a policy gives no estimate

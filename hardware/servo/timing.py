@@ -76,6 +76,6 @@ class Timing:
         return [
             *(f"note: {note}" for note in self.notes),
             *(decided if total else []),
-            f"{self.steps} steps at {self.rate_hz:.1f} Hz, fresh frames at {self.fresh_hz:.1f} Hz, {self.dropped} frames dropped",
+            f"{self.steps} steps at {self.rate_hz:.1f} Hz, fresh frames at {self.fresh_hz:.1f} Hz, dropped frames: {self.dropped}",
             *(f"{what}: {spread}" for what, spread in spreads.items() if np.isfinite(spread.p50)),
         ]

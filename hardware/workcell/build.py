@@ -32,7 +32,7 @@ from hardware.workcell.ros2 import publishing
 from scenes import ObjectSpec, PlacementSpec, SensorSpec
 from scenes.experiment import ExperimentSpec
 from scenes.plugins import offered, others
-from twin.errors import ErrorsAs, FrameError, RenderError
+from twin.errors import ErrorsAs, FrameError, RenderError, format_count
 from twin.estimate import Estimate, SensorModel
 from twin.frames import open_recording
 from twin.optics.preview import Preview
@@ -259,7 +259,7 @@ def check_plan(
         back = f"no straight path back from {len(blocked)} of {len(planned)} planned poses: from there the arm returns on its own path"
     return [
         *seen,
-        f"path: {len(way) - 1} moves, {way_mm:.0f} mm, to {' '.join(f'{value:.1f}' for value in planned[0])} (mm, deg)",
+        f"path: {format_count(len(way) - 1, 'moves')}, {way_mm:.0f} mm, to {' '.join(f'{value:.1f}' for value in planned[0])} (mm, deg)",
         f"limits: {back}",
         f"time: about {way_mm / linear_mm_s + spent_s:.0f} s",
     ]

@@ -31,7 +31,7 @@ class Hexagon(RingedLayout):
         return np.column_stack([z.real, z.imag])
 
     def in_words(self) -> str:
-        return f"in a hexagon of {self.rings} rings"
+        return f"in a hexagon of {self.rings} ring{'s' * (self.rings > 1)}"
 
     @classmethod
     @cache

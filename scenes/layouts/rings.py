@@ -28,7 +28,7 @@ class Rings(RingedLayout):
         return np.column_stack([z.real, z.imag])
 
     def in_words(self) -> str:
-        return f"in {self.rings} rings"
+        return f"in {self.rings} ring{'s' * (self.rings > 1)}"
 
     @classmethod
     def find(cls, labelled: NDArray[np.bool_], shown: NDArray[np.bool_]) -> tuple[Self, NDArray[np.intp]] | None:

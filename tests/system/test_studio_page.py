@@ -362,6 +362,7 @@ def test_a_specification_is_proposed_corrected_and_used(studio, client, tmp_path
     assert "UNSURE" in wait_html(client, "91 pins in a hexagon of 5 rings")
     client.set("Use this sensor", True)
     client.wait(lambda update: update.number > 0 and "my-sensor" in str(client.value("sensor")), 2 * WAIT_S)
+    assert studio.twin.state.pose["depth_mm"] > 0, "a sensor without contact shows nothing"
     studio.twin.open(first_state(None, SENSOR, "sphere"))
 
 

@@ -95,7 +95,7 @@ def test_too_few_frames_are_an_answer_and_not_a_clean_bill(planted, frames):
     rows = touching[:frames]
     found = audit_labels(pins.rows(rows), *arm(labels[rows]))
     assert (
-        f"{frames} frames in contact are too few to find out which moves were executed" in found.not_assessed
+        f"too few frames in contact ({frames}) to find out which moves were executed" in found.not_assessed
         and "280 are needed" in found.not_assessed
     )
     assert np.isnan(found.executed).all() and np.isnan(found.chi2).all() and np.isnan(found.depth_per_move)

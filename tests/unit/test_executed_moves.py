@@ -38,11 +38,11 @@ def test_forms_that_tables_have_mean_the_same(tmp_path, content):
 @pytest.mark.parametrize(
     ("content", "said", "known"),
     [
-        (PLAIN.replace(",0\n", ",maybe\n"), "1 rows hold no number from 0 to 1", 2),
-        (PLAIN.replace(",0\n", ",2\n"), "1 rows hold no number from 0 to 1", 2),
-        (PLAIN + "frame_2_0.png,1\n", "1 rows contradict an earlier row", 2),
-        (PLAIN + "frame_9_0.png,1\n", "1 rows name no frame here (frame_9_0.png)", 3),
-        (PLAIN[: PLAIN.index("frame_3")], "1 frames have no usable row; their moves count as executed (frame_3_0.png)", 2),
+        (PLAIN.replace(",0\n", ",maybe\n"), "1 row without a number from 0 to 1", 2),
+        (PLAIN.replace(",0\n", ",2\n"), "1 row without a number from 0 to 1", 2),
+        (PLAIN + "frame_2_0.png,1\n", "1 row against an earlier row", 2),
+        (PLAIN + "frame_9_0.png,1\n", "1 row for no frame here (frame_9_0.png)", 3),
+        (PLAIN[: PLAIN.index("frame_3")], "1 frame without a usable row, counted as executed (frame_3_0.png)", 2),
         ("image_name,done\nframe_1_0.png,1\n", "no column executed", 0),
         ("name,executed\nframe_1_0.png,1\n", "it is not used, and every move counts as executed", 0),
     ],

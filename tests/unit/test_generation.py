@@ -342,7 +342,7 @@ def test_a_full_disk_ends_the_run_in_one_line(made, tmp_path, monkeypatch):
         os.fsync(number)
 
     monkeypatch.setattr(atomic, "os", SimpleNamespace(**vars(os) | {"fsync": full}))
-    with pytest.raises(DatasetError, match=r"No space left on device\); free some space .*; 2 contacts are kept"):
+    with pytest.raises(DatasetError, match=r"No space left on device\); free some space .*; 2 contacts kept"):
         generate(tmp_path / "set", config, COUNT)
     assert not list(tmp_path.rglob("*.part"))
     monkeypatch.undo()

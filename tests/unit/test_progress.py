@@ -60,11 +60,26 @@ def test_without_a_terminal_a_line_is_printed_every_ten_seconds_and_no_more_ofte
     assert out.getvalue().splitlines()[-1] == "press: 25%"
 
 
+def test_a_long_stage_is_a_line_for_each_tenth():
+    now_s, out = [0.0], io.StringIO()
+    lines = Lines(out, clock=lambda: now_s[0])
+    with stage(lines, "contacts") as step:
+        for done in range(1, 301):
+            now_s[0] += 9.0
+            step(done, 300, f"{done} px")
+    said = out.getvalue().splitlines()
+    assert len(said) == len(set(said)) == 11 and said[0].startswith("contacts: 2 of 300") and said[-1].startswith("contacts: 300 of 300"), (
+        said
+    )
+
+
 def test_a_line_is_printed_also_while_nothing_is_reported():
     out = io.StringIO()
     with Lines(out, every_s=0.02) as lines:
         lines("mesh", 0, 0)
-        wait_until(lambda: out.getvalue().count("mesh: begun") >= 2)
+        wait_until(lambda: "mesh: begun" in out.getvalue())
+        time.sleep(0.1)
+        assert out.getvalue() == "mesh: begun\n", "no line comes twice"
         with stage(lines, "contacts") as step:
             step(3, 40)
             wait_until(lambda: "contacts: 3 of 40" in out.getvalue())

@@ -8,7 +8,7 @@ import pytest
 
 import hardware.collect.record as module
 from hardware.cameras.choose import open_camera
-from hardware.cameras.picture_page import LINE_PX, PicturePage
+from hardware.cameras.picture_page import LINE, PicturePage
 from hardware.collect.record import GIVE_UP_S, PATIENCE_S, describe_picture, record_frames
 from hardware.errors import DeviceError
 from twin.frames import open_recording
@@ -90,7 +90,14 @@ def test_where_nothing_new_comes_the_command_ends_and_keeps_what_it_has(tmp_path
         record(Pictures(session(CONTACTS[:2]).pictures + rest), tmp_path / "mine", 9)
     assert len(open_recording(tmp_path / "mine")) == 2
     monkeypatch.setattr(module, "ENOUGH", 2)
-    assert record(Pictures(session(CONTACTS[:2]).pictures + rest), tmp_path / "enough", 9).count == 2
+    told = []
+    made = record_frames(Pictures(session(CONTACTS[:2]).pictures + rest), tmp_path / "enough", count=9, say=told.append)
+    assert made.count == 2 and any(
+        note.startswith("ended at 2 of 9 contacts, after 60 s without a new one (press at") for note in made.notes
+    )
+    assert [line for line in told if "of 9 contacts" in line] == [
+        "2 of 9 contacts; press at another place, lightly or firmly, and hold still. Without a new one it ends in 45 s"
+    ], "once, and in terms of what to do"
     with pytest.raises(DeviceError, match="has frames already; give a new folder"):
         record(session(CONTACTS), tmp_path / "mine", 2)
     with pytest.raises(DeviceError, match="no frame; check the camera"):
@@ -122,13 +129,13 @@ def test_thresholded_pictures_are_not_judged():
     assert describe_picture(np.where(picture() > 100, 255, 0).astype(np.uint8)) == ""
 
 
-def test_the_page_shows_the_newest_picture_below_a_line_of_text():
+def test_the_page_shows_the_newest_picture_and_a_line_of_text():
     with PicturePage() as page:
         page.show(picture(), "3/40  hold still")
         assert b'<img src="/stream.mjpg"' in urlopen(page.url, timeout=5).read()
+        assert urlopen(page.url.rstrip("/") + LINE, timeout=5).read() == b"3/40  hold still"
         with open_camera(page.url + "stream.mjpg") as camera:
-            first = camera.read(timeout_s=5.0).image
-            assert first.shape[:2] == (SIZE[0] + LINE_PX, SIZE[1]) and first[:LINE_PX].max() > 200
+            assert camera.read(timeout_s=5.0).image.shape[:2] == SIZE
             page.show(np.zeros((*SIZE, 3), np.uint8) + np.uint8([200, 0, 0]), "")
             newest = camera.read(timeout_s=5.0).image
-            assert abs(int(newest[LINE_PX + 30, 50, 0]) - 200) < 8 and newest[LINE_PX + 30, 50, 1] < 20
+            assert abs(int(newest[30, 50, 0]) - 200) < 8 and newest[30, 50, 1] < 20

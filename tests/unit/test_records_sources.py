@@ -119,7 +119,7 @@ def test_moves_that_were_not_executed_are_taken_out_and_said(tmp_path, to):
     source = recording(tmp_path / "r", pose_2=(1, 2, 3), pose_6=(10, 20, 30), move_1=(0.5, 1, 2), move_6=(4, 5, 6))
     (source / "move_executed.csv").write_text("image_name,executed\n" + "".join(f"{name},{k % 2}\n" for k, name in enumerate(NAMES)))
     done = convert([source], tmp_path / "out", to)
-    assert any("moves of 2 frames were not, or not certainly, executed" in note for note in done.notes)
+    assert any("moves that were not, or not certainly, executed (2) are removed" in note for note in done.notes)
     steps = [step.values for episode in open_records(tmp_path / "out").episodes for step in episode.steps()]
     assert [step["pose"][[0, 1, 5]].tolist() for step in steps] == [[-0.5, 1, 6], [0, 2, 20], [-2, 3, 24]]
     assert [step["move"][[0, 5]].tolist() for step in steps] == [[0, 0], [1, 5], [0, 0]]

@@ -37,9 +37,9 @@ def test_a_move_that_is_not_known_spoils_no_pose_that_is():
 def test_what_is_missing_is_said(tmp_path):
     with pytest.raises(FrameError, match=r"no labels pose_1\.\.6 \(found no table\)"):
         read_arm_labels(recording(tmp_path, ""))
-    with pytest.raises(FrameError, match=r"1 rows hold no number in a pose or move \(b.png\)"):
+    with pytest.raises(FrameError, match=r"rows without a number in a pose or move \(b.png\)"):
         read_arm_labels(recording(tmp_path, "image_name,pose_2\na.png,1\nb.png,nan\n"))
-    with pytest.raises(FrameError, match=r"1 rows hold no number in a pose or move \(b.png\)"):  # not all rows, where one cell is text
+    with pytest.raises(FrameError, match=r"rows without a number in a pose or move \(b.png\)"):  # not all rows, where one cell is text
         read_arm_labels(recording(tmp_path, "image_name,pose_2\na.png,1\nb.png,1 mm\n"))
 
 

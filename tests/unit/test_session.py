@@ -212,7 +212,7 @@ def test_what_follows_a_damaged_line_is_left_out_and_told(tmp_path):
     with (folder / STEPS).open("a") as file:
         file.write('{"frame": \n{"step": 3}\n')
     frames, notes = replayed(folder)
-    assert len(frames) == 2 and notes == ["steps.jsonl: line 3 is cut or damaged; the 2 steps before it are read"]
+    assert len(frames) == 2 and notes == ["steps.jsonl: line 3 is cut or damaged; the lines before it are read"]
 
 
 def test_missing_lines_are_not_passed_over(tmp_path):
@@ -222,7 +222,7 @@ def test_missing_lines_are_not_passed_over(tmp_path):
             session.append(frame(k), {})
     lines = (folder / STEPS).read_text().splitlines(keepends=True)
     (folder / STEPS).write_text("".join(lines[:2]))
-    assert replayed(folder)[1] == ["2 pictures in frames/ have no step in steps.jsonl: the session was interrupted"]
+    assert replayed(folder)[1] == ["frames/ has pictures without a step in steps.jsonl (2): the session was interrupted"]
     (folder / STEPS).write_text("".join([*lines[:1], *lines[2:]]))
     with pytest.raises(FrameError, match="steps.jsonl, line 2 is of step 2: lines are missing"):
         SessionSource(folder)

@@ -190,7 +190,7 @@ def test_an_impossible_skin_is_refused_by_name(name, section, values, words):
 
 def test_pins_beyond_the_corner_of_a_rectangle_are_counted():
     sensor = changed(load_sensor("pad-rectangular"), pins={"phase_deg": 30.0})
-    with pytest.raises(SpecError, match="pins stand beyond the flat part of the pad"):
+    with pytest.raises(SpecError, match="pins beyond the flat part of the pad"):
         rest_pins(sensor.geometry)
 
 

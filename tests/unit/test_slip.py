@@ -184,4 +184,4 @@ def test_slip_of_simulated_drags_is_judged_and_said(contacts, tmp_path):
     write_slip(tmp_path / "run" / SLIP, slip.SlipModel(network, 1.0, np.ones(network.enter.in_features // 2), 0.5, 1.0, 1.0))
     found = evaluate_run(tmp_path / "run", [folder], tmp_path / "out", rows="all")
     assert found.metrics["slip"]["contacts"] == 10 and found.metrics["maps"]["states"] > 20
-    assert sum("slip of 10 contacts" in line or "contact maps of" in line for line in found.lines()) == 2
+    assert sum("slip (contacts: 10)" in line or "contact maps (states: " in line for line in found.lines()) == 2

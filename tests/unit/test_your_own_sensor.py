@@ -12,7 +12,8 @@ from scipy.spatial import cKDTree
 from unknown_sensor import RADIUS, SIZE, frames_of, rest_of
 
 from scenes import load_sensor
-from scenes.pins import PinsSpec
+from scenes.pins import PinsSpec, layout_from
+from scenes.sensor import UNSURE_LAYOUT
 from training.estimate.estimator import PoseEstimator
 from training.studies.evaluation import predict_frames
 from twin.calibration.camera_pose import CameraReport
@@ -23,7 +24,7 @@ from twin.frames import frames_at, open_recording
 from twin.geometry.pins import pin_lattice, rest_pins, usual_spacing
 from twin.optics.relief import cap_planes
 from twin.pins import Pipeline, nominal_reference, with_detector
-from twin.pins.batch import recording_reference
+from twin.pins.batch import draw_overlay, recording_reference
 from twin.pins.check import Grade, examine
 from twin.pins.detectors.detector_spec import shipped_detector
 from twin.pins.detectors.tune import _at_rest, tune
@@ -90,7 +91,7 @@ def test_a_folder_of_frames_becomes_a_sensor(made):
     assert "What is assumed" in page and "overlay-1.png" in page
     note, few = [line for line in found.lines() if line.startswith("note: ")]
     assert "skipped frame_4.png: truncated PNG" in note and "skipped frame_4.png" in page, "what was left out is told"
-    assert "4 frames are few" in few, few
+    assert "too few frames (4)" in few, few
 
 
 def test_the_next_steps_name_the_files_and_colour_frames_that_were_thresholded_get_no_light(tmp_path):
@@ -142,7 +143,7 @@ def test_lengths_that_do_not_belong_to_the_camera_are_found_by_a_check(made):
 
 def test_a_layout_of_too_few_pins_for_a_camera_is_told(tmp_path):
     folder = folder_of(tmp_path, frames_of(rest_of(PinsSpec(rings=2)), 2))
-    with pytest.raises(FrameError, match="19 pins are seen in most frames, as 19 pins in 2 rings: too few.*light fades"):
+    with pytest.raises(FrameError, match="too few pins .19, as 19 pins in 2 rings. to fit a camera.*light fades"):
         new_sensor(folder, tmp_path / "few.toml")
     assert not (tmp_path / "few.toml").exists()
 
@@ -257,6 +258,53 @@ def test_a_layout_that_was_given_and_is_wrong_is_told_which_one_is_right():
     assert _compare_layout(PINS, images).sure
 
 
+def test_pins_of_a_dark_frame_are_seen_in_its_overlay_beside_a_bright_housing_and_have_numbers():
+    spec = load_sensor("mg400-127")
+    pipeline = Pipeline(spec, Form.RAW)
+    frame = drawn_frame(spec, Form.RAW, pipeline.reference.pins_px)
+    seen = pipeline(frame)
+    dark = (frame.image // 16).astype(np.uint8)
+    cv2.circle(dark, tuple(seen.pins_px.mean(axis=0).round().astype(int).tolist()), 230, 255, 12)
+    pictures = [draw_overlay(Frame(dark, Form.RAW), seen, scale=3, numbers=numbers) for numbers in (False, True)]
+    x, y = np.rint(3 * seen.pins_px[0]).astype(int)
+    beside = pictures[0][y - 8 : y + 9, x - 8 : x + 9].min(axis=2)
+    assert np.percentile(beside, 75) > 60, "the cap around the first pin's dot"
+    assert (pictures[0] != pictures[1]).any(axis=2).sum() > 10 * spec.pins.count
+
+
+def test_a_refused_estimate_of_a_sensor_whose_layout_is_unsure_points_at_the_layout(tmp_path):
+    image = np.zeros(PoseEstimator.load("mg400-127").pipeline.size_px[::-1], np.uint8)
+    cv2.imwrite(str(tmp_path / "f_0.png"), image)
+    for unsure in (False, True):
+        predictions = predict_frames("mg400-127", tmp_path)
+        sensor = predictions.estimator.sensor
+        description = f"{sensor.description} {UNSURE_LAYOUT}" if unsure else sensor.description
+        predictions.estimator.sensor = sensor.model_copy(update={"description": description})
+        said = []
+        with pytest.raises(FrameError, match="none of 1 frames gave a pose"):
+            for line in predictions.lines():
+                said.append(line)
+        assert any("unsure of the layout" in line for line in said) == unsure
+
+
+def test_a_pin_that_the_nearest_layouts_have_too_many_is_named_by_its_place_and_the_way_out_ends(tmp_path):
+    """29 pins: of 5 columns and 6 rows one is missing, of 7 rows more are; neither is given in turn, and corrected pins are sure."""
+    rest = rest_of(PinsSpec(layout="grid", columns=5, rows=6))
+    folder = folder_of(tmp_path, frames_of(np.delete(rest, 29, axis=0), 4))
+    found = new_sensor(folder, tmp_path / "mine.toml")
+    place = re.search(r"no pin is seen at \((\d+), (\d+)\) px", found.lines()[0])
+    assert not found.identified.sure and np.linalg.norm(np.array(place.groups(), float) - rest[29]) < 8, found.lines()[0]
+    taller = _compare_layout(PinsSpec(layout="grid", columns=5, rows=7), frames_of(np.delete(rest, 29, axis=0), 4))
+    (doubt,) = taller.doubts
+    assert not taller.sure and doubt.count("no pin is seen at") == 2 and "leave `layout` out" not in doubt, doubt
+    (step,) = [line for line in found.next_steps if "pins.csv" in line]
+    offered, copy = re.search(r"copy (\S+) to (\S+),", step).groups()
+    Path(copy).write_text(Path(offered).read_text())
+    assert f"--layout positions:{copy}" in step
+    again = new_sensor(folder, tmp_path / "mine.toml", layout=layout_from(f"positions:{copy}"))
+    assert again.identified.sure and again.health.all_pins == 1.0, again.lines()
+
+
 def test_a_layout_of_no_known_kind_is_asked_for(tmp_path):
     """Rings of 8, 16 and 24 pins: the frame without contact is not what is wrong."""
     places = [(0.0, 0.0)] + [(5.2 * r * np.cos(a), 5.2 * r * np.sin(a)) for r in (1, 2, 3) for a in np.arange(8 * r) * np.pi / (4 * r)]
@@ -288,7 +336,7 @@ def test_stretched_and_few_frames_are_told():
     assert "which is much for a frame without contact" in much
     assert not _doubtful(CameraReport(0.15 * spacing, 61, {}, {}), Rest(rest.pins_px, "made"), 40), "contacts tell rest places no better"
     assert "stretched" in _doubtful(CameraReport(0.3 * spacing, 61, {}, {}), rest, 40)[0]
-    assert "3 frames are few" in _doubtful(CameraReport(0.05 * spacing, 61, {}, {}), rest, 3)[0]
+    assert "too few frames (3)" in _doubtful(CameraReport(0.05 * spacing, 61, {}, {}), rest, 3)[0]
 
 
 def test_a_place_that_was_forgotten_is_asked_for():

@@ -192,7 +192,7 @@ class LabelColumns:
         if fitting:
             return fitting[-1], ""
         return lowest, (
-            f"{touching} frames in contact are too few to find out which moves were executed: a map that is fitted to so few follows every "
+            f"too few frames in contact ({touching}) to find out which moves were executed: a map that is fitted to so few follows every "
             f"label, right or wrong; {needed[lowest]} are needed"
         )
 

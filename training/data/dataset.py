@@ -12,6 +12,7 @@ from training.data.simulated import contact_labels, is_pins_only, is_simulated, 
 from training.data.targets import CONTACT, CONTACT_UNITS, Targets, choose_targets, joined_targets
 from twin.errors import FrameError
 from twin.frames import natural_key, open_recording
+from twin.frames.tables import describe_count
 from twin.pins import nominal_reference
 from twin.progress import Step
 from twin.rig.labels import label_slope, plate_slope
@@ -140,10 +141,10 @@ def load_dataset(
         targets = targets.instead(labels_of_surface(Path(folder), pins.image_name))
     unseen = ~pins.valid
     if unseen.any():
-        problems.append(f"{_list_names(pins.image_name[unseen])}: pins not found; left out of training")
+        problems.append(f"{describe_count('frames', pins.image_name[unseen])}: pins not found; left out of training")
     unlabelled = pins.valid & ~np.isfinite(targets.raw).all(axis=1)
     if unlabelled.any():
-        problems.append(f"{_list_names(pins.image_name[unlabelled])}: no number in {', '.join(targets.names)}; left out")
+        problems.append(f"{describe_count('frames', pins.image_name[unlabelled])}: no number in {', '.join(targets.names)}; left out")
     good = np.flatnonzero(pins.valid & ~unlabelled)
     if not len(good):
         raise FrameError(f"{folder}: no frame has both pins and labels; {'; '.join(problems[:3])}")
@@ -231,7 +232,3 @@ def split_rows(count: int, seed: int, group: np.ndarray | None = None) -> tuple[
     shuffled = np.random.default_rng(seed).permutation(count)
     out_count = -(-count // HELD_OUT)
     return np.sort(shuffled[out_count:]), shuffled[:out_count]
-
-
-def _list_names(names: np.ndarray) -> str:
-    return f"{len(names)} frames ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})"

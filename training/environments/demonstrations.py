@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from training.environments.batch import PERIOD_S, Batch, Options, require_whole
-from twin.errors import TwinError
+from twin.errors import TwinError, format_count
 from twin.frames.lerobot import RESTS
 from twin.progress import Progress, silent, stage
 from twin.records.convert import open_writer
@@ -54,7 +54,7 @@ class Demonstrations(ReadableResult):
 
     def lines(self) -> list[str]:
         """The result as lines of text."""
-        lines = [f"{self.episodes} episodes, {self.steps} steps as a LeRobot data set"]
+        lines = [f"{format_count(self.episodes, 'episodes')}, {format_count(self.steps, 'steps')} as a LeRobot data set"]
         return [*lines, f"{self.failed} further episodes were not solved and are left out"] if self.failed else lines
 
 

@@ -8,7 +8,7 @@ from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec, lo
 from training.generation.config import GenerationConfig, Images, States, require_count
 from training.generation.make import REST, make_contact
 from training.generation.store import CONFIG, FILES, Store, refuse_foreign
-from twin.errors import OptionError
+from twin.errors import OptionError, format_count
 from twin.frames.forms import frame_size
 from twin.progress import Progress, Step, silent, stage
 from twin.records import KeptAlso
@@ -47,10 +47,10 @@ class Simulated(ReadableResult):
 
     def lines(self) -> list[str]:
         """The result as lines of text."""
-        lines = [f"{self.before} contacts were there before"] if self.before else []
+        lines = [f"{format_count(self.before, 'contacts')} from before"] if self.before else []
         if self.failed:
-            lines.append(f"{self.failed} contacts failed and were sampled again: see {self.folder / 'failures.csv'}")
-        return [*lines, f"{self.frames} frames of {self.contacts} contacts"]
+            lines.append(f"{format_count(self.failed, 'contacts')} failed and sampled again: see {self.folder / 'failures.csv'}")
+        return [*lines, f"{format_count(self.frames, 'frames')} of {format_count(self.contacts, 'contacts')}"]
 
 
 def generate(

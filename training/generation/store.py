@@ -22,7 +22,7 @@ from scenes.files import read_regular
 from training.generation.config import DatasetError, GenerationConfig
 from training.generation.make import REST, Outcome, make_contact
 from twin import store
-from twin.errors import ErrorsAs, StoreError
+from twin.errors import ErrorsAs, StoreError, format_count
 from twin.frames.truth import TRUTH, image_name
 from twin.store import write_text
 
@@ -189,7 +189,7 @@ class Store:
 
     def _unfinished_error(self, error: StoreError) -> DatasetError:
         done = len(self.list_finished() - {REST})
-        return DatasetError(f"{error}; {done} contacts are kept, and the same command resumes from there")
+        return DatasetError(f"{error}; {format_count(done, 'contacts')} kept, and the same command resumes from there")
 
 
 def read_record(path: Path) -> dict[str, Any]:

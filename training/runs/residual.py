@@ -24,7 +24,7 @@ from twin.calibration.sensor_file import write_sensor
 from twin.camera.capture import CHROMA_RANGE, LUMA_RANGE, before_stream, expose, luma_weights
 from twin.camera.projection import Disc, lens_disc
 from twin.camera.residual import LEAK, LEVELS, MIDDLE, MOST_LEVELS, STEEPNESS, differences, with_residual
-from twin.errors import FrameError
+from twin.errors import FrameError, format_count
 from twin.evaluation.pictures.aligned import with_changes
 from twin.evaluation.pictures.frames import read_real
 from twin.evaluation.pictures.images import compare_images
@@ -106,7 +106,7 @@ class TaughtResidual:
         ]
         return [
             *lines,
-            f"{self.frames} frames, each with a network that did not see it",
+            f"{format_count(self.frames, 'frames')}, each with a network that did not see it",
             *told,
             f"PSNR over the disc {self.psnr_db[0]:.2f} -> {self.psnr_db[1]:.2f} dB; "
             f"pins moved by {self.shift_px[0]:.3f} px (median), {self.shift_px[1]:.3f} px (95 %)",
@@ -141,7 +141,7 @@ def calibrate_residual(
     with stage(progress, "read the frames, find their pins") as step:
         read = read_real(frames, sensor, disc, fitted=fitted, progress=step)
     if len(read.frames) < LEAST_TAUGHT:
-        raise FrameError(f"{frames}: {len(read.frames)} frames are valid beside the {fitted} fitted ones; give {LEAST_TAUGHT} or more")
+        raise FrameError(f"{frames}: valid frames beside the {fitted} fitted ones: {len(read.frames)}; give {LEAST_TAUGHT} or more")
     fit, renderer, light = SkinFit(sensor), Renderer(sensor), []
     with stage(progress, "fit the skin to the pins, render") as step:
         for done, each in enumerate(read.frames):
@@ -167,7 +167,7 @@ def calibrate_residual(
         float(np.mean([compare_images(a, b, disc.inside).psnr_db for a, b in zip(real, shown, strict=True)])) for shown in (plain, found)
     ]
     spec = with_changes(sensor, response={"residual": residual.model_dump()})
-    write_sensor(out, spec, f"With a residual network that was trained on {len(real)} frames of {frames.name}.")
+    write_sensor(out, spec, f"With a residual network that was trained on {format_count(len(real), 'frames')} of {frames.name}.")
     return TaughtResidual(
         spec, len(real), before, after, real_told, (psnr[0], psnr[1]), _shift_px(sensor, plain, found), read.refused, [out]
     )

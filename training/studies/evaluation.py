@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from scenes.sensor import UNSURE_LAYOUT
 from training.data.dataset import Dataset, join_datasets, load_dataset
 from training.data.simulated import is_simulated
 from training.errors import TrainingError
@@ -20,7 +21,7 @@ from training.studies.judging import measure_changes, measure_errors, rows_to_ev
 from training.touch.contact_maps import compare_maps
 from training.touch.slip import CapView, compare_slip, name_drags, random_places, resample_path
 from twin.camera.projection import project_in_form
-from twin.errors import FrameError
+from twin.errors import FrameError, format_count
 from twin.estimate import readable_labels
 from twin.frames import Recording, evenly_read, open_recording
 from twin.frames.folders import IMAGE_FOLDERS, references_in
@@ -133,23 +134,23 @@ class Evaluation(ReadableResult):
             lines.append("taken for " + ", ".join(f"{kind} {100 * share:.1f} %" for kind, share in taken.items()))
         if maps := self.metrics.get("maps"):
             lines.append(
-                f"contact maps of {maps['states']} states: patch's intersection over union {maps['patch_iou']:.2f}, correlation of the "
+                f"contact maps (states: {maps['states']}): patch's intersection over union {maps['patch_iou']:.2f}, correlation of the "
                 f"pressure {maps['pressure_correlation']:.2f} and of the shear {maps['shear_correlation']:.2f}, "
                 f"error of the total force {100 * maps['resultant']:.1f} %"
             )
         if slip := self.metrics.get("slip"):
             lines.append(
-                f"slip of {slip['contacts']} contacts: gross slip classified correctly in {100 * slip['whole_accuracy']:.1f} % of the "
+                f"slip (contacts: {slip['contacts']}): gross slip classified correctly in {100 * slip['whole_accuracy']:.1f} % of the "
                 f"frames, alarm {slip['lead_mm']:.2f} mm of drag before it, false alarm in {100 * slip['false_alarms']:.1f} % of the "
                 f"frames without slip; error of the sliding share {slip['share']:.2f}, of the remaining distance {slip['left_mm']:.2f} mm"
             )
         if self.metrics["leak_slope"] is not None:
             lines.append(f"slope of the angle's error on a twist that was not executed: {self.metrics['leak_slope']:+.3f}")
         ms = self.metrics["ms_per_frame"]
-        lines.append(f"{self.frames} frames" + ("" if ms is None else f", {ms:.1f} ms per frame (median, one thread)"))
+        lines.append(format_count(self.frames, "frames") + ("" if ms is None else f", {ms:.1f} ms per frame (median, one thread)"))
         for row in self.changes:
             said = (f"{label} {row[f'{name}_mae']:.4g} ({100 * row[f'{name}_more']:+.1f} %)" for name, label in labels.items())
-            lines.append(f"{row['change']}: {', '.join(said)}; {row['not_valid']} frames not valid")
+            lines.append(f"{row['change']}: {', '.join(said)}; {format_count(row['not_valid'], 'frames')} not valid")
         return lines
 
 
@@ -282,6 +283,8 @@ class Predictions:
         for bad in self.recording.failed:
             yield f"skipped {bad['image_name']}: {bad['reason']}"
             reasons.append(f"{bad['image_name']}: {bad['reason']}")
+        if reasons and UNSURE_LAYOUT in self.estimator.sensor.description:
+            yield "note: 'twin new' was unsure of the layout of this sensor's pins, which may be why: decide it, and train again"
         if not poses:
             raise FrameError(f"{self.recording.path}: none of {len(self.recording)} frames gave a pose ({reasons[0]}); give other frames")
 

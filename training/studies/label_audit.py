@@ -53,10 +53,10 @@ class LabelAudit(ReadableResult):
     def lines(self) -> list[str]:
         """The result as lines of text."""
         if self.audit.not_assessed:
-            lines = [f"{self.frames} frames: {self.audit.not_assessed}", "no labels_corrected.csv: the labels are not assessed"]
+            lines = [f"{self.audit.not_assessed} (frames: {self.frames})", "no labels_corrected.csv: the labels are not assessed"]
         else:
             undone, undecided = self.summary["moves_not_executed"], self.summary["undecided"]
-            lines = [f"{self.frames} frames; in {undone['frames']} the move was not executed; {undecided} undecided"]
+            lines = [f"frames: {self.frames}; in {undone['frames']} the move was not executed; {undecided} undecided"]
         for key in (*LISTS, "reader"):
             if names := self.summary[key]:
                 more = ", ..." if len(names) > SAID else ""

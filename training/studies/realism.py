@@ -9,7 +9,7 @@ import numpy as np
 
 from scenes import SensorSpec
 from training.data.two_sample import SMALL, TwoSample, accuracy_text, evaluate_classifiers, evaluate_halves
-from twin.errors import OptionError
+from twin.errors import OptionError, format_count
 from twin.evaluation.pictures.realism import run_realism
 from twin.progress import Progress, Step, silent
 from twin.store import writes
@@ -134,6 +134,6 @@ def _thorough(real: list[np.ndarray], rendered: list[np.ndarray], inside: np.nda
 def _image_line(title: str, count: int, images: dict[str, Any]) -> str:
     mean = {name: images[name]["mean"] for name in IMAGES}
     return (
-        f"{title}, {count} frames: PSNR {mean['psnr_db']:.2f} dB (gray {mean['psnr_gray_db']:.2f}), "
+        f"{title}, {format_count(count, 'frames')}: PSNR {mean['psnr_db']:.2f} dB (gray {mean['psnr_gray_db']:.2f}), "
         f"SSIM {mean['ssim']:.3f} (gray {mean['ssim_gray']:.3f}), FLIP {mean['flip']:.3f}; whole frame {mean['psnr_whole_db']:.2f} dB"
     )

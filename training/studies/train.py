@@ -165,7 +165,7 @@ def add_maps(run: Path, config: RunConfig, data: Dataset) -> list[str]:
     data = data.in_order()
     rows, estimator = training_rows(config, data), PoseEstimator.load(run)
     if len(rows) < FEWEST_STATES:
-        return [f"{len(rows)} contact states are too few to train contact maps ({FEWEST_STATES} are needed): the run has none"]
+        return [f"too few contact states to train contact maps ({len(rows)}; {FEWEST_STATES} are needed): the run has none"]
     write_maps(run / MAPS, learn_maps(estimator.modes_of(data.pins), data, rows, seed=config.seed))
     return []
 
@@ -224,7 +224,7 @@ def add_slip(run: Path, config: RunConfig, parts: Sequence[Dataset]) -> list[str
     slide = sum(np.isfinite(drag.whole_mm) for drag in drags)
     if slide < FEWEST_DRAGS:
         return [
-            f"{slide} contacts are dragged until they slide ({FEWEST_DRAGS} are needed to train slip): slip is not estimated over time; "
+            f"too few contacts are dragged until they slide ({slide}; {FEWEST_DRAGS} are needed): slip is not estimated over time; "
             "'twin dataset --experiment drag --randomise drag --states all' makes such contacts"
         ]
     sensor = parts[0].pins.sensor

@@ -42,12 +42,12 @@ class Validation(ReadableResult):
         if self.sensor.rig is None:
             lines.append(f"note: {self.sensor.name} has no [rig]: the tool point counts as the tip; 'twin calibrate contact' fits one")
         for row in self.summary["table"]:
-            lines.append(f"{row['group']}: {row['error_px']:.2f} px over {row['frames']} frames, nothing free")
+            lines.append(f"{row['group']}: {row['error_px']:.2f} px, nothing free (frames: {row['frames']})")
         if own := self.summary["one_friction_a_frame"]:
             common_px = own["error_with_common_friction_px"]
-            lines.append(f"one friction a frame, {own['frames']} frames: {own['error_px']:.2f} px (common friction: {common_px:.2f} px)")
+            lines.append(f"one friction a frame (frames: {own['frames']}): {own['error_px']:.2f} px (common friction: {common_px:.2f} px)")
         if failures := self.comparison.failures:
-            lines.append(f"{len(failures)} contacts failed: see frames.csv")
+            lines.append(f"failed contacts: {len(failures)}; see frames.csv")
         return lines
 
 

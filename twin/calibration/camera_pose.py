@@ -139,7 +139,7 @@ def fit_camera(
     pins_px = pins_px[seen]
     if not LEAST_PINS <= len(pins_px) <= spec.pins.count:
         raise FrameError(
-            f"{len(pins_px)} pins found of {spec.pins.count}; between {LEAST_PINS} and all are needed: give another no-contact frame"
+            f"{len(pins_px)} of {spec.pins.count} pins found; between {LEAST_PINS} and all are needed: give another no-contact frame"
         )
     names, held = [name for name in PARAMETERS if name in free], {}
     order = seen if named else nearest_order(spec, pins_px)

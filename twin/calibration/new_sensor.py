@@ -8,12 +8,12 @@ from scipy.spatial import Delaunay
 
 from scenes.layouts.base import LatticeLayout
 from scenes.pins import PinsSpec
-from scenes.sensor import AppearanceSpec, BlobSpec, CameraSpec, PipelineSpec, Polarity, SensorSpec
+from scenes.sensor import UNSURE_LAYOUT, AppearanceSpec, BlobSpec, CameraSpec, PipelineSpec, Polarity, SensorSpec
 from twin.calibration.assumptions import AssumptionCost, cost_of_assumptions
 from twin.calibration.camera_pose import LEAST_PINS, MODEL_PX, CameraReport, fit_camera
 from twin.calibration.sensor_file import sibling_folder, write_sensor
 from twin.calibration.size import of_radius, require_radius
-from twin.errors import FrameError
+from twin.errors import FrameError, format_count
 from twin.frames import Recording, evenly_read, frames_at, open_recording, spread_indices
 from twin.frames.forms import blob_spec, gray_levels, pin_levels
 from twin.frames.images import write_image
@@ -24,13 +24,13 @@ from twin.pins.check import CAPS_MEASURED, lost_in_view, usual_caps
 from twin.pins.detectors.detector_spec import UNKNOWN_BLOCK_PX, UNKNOWN_OFFSET, DetectorSpec, camera_seeing, whole_recording, with_detector
 from twin.pins.detectors.tune import Tuned, tune
 from twin.pins.finding.caps import measure_caps
-from twin.pins.labelling.identify import STEADY, Candidate, Identified, identify, score_layout, unnamed_spots
+from twin.pins.labelling.identify import STEADY, SURE_AHEAD, SURE_EXPLAINED, Candidate, Identified, identify, score_layout, unnamed_spots
 from twin.pins.labelling.rest import Rest, rest_of, turn_of
 from twin.pins.pipeline import Pipeline
 from twin.progress import Progress, silent, stage
 from twin.report.page import Page, PagePicture
 from twin.report.table import number
-from twin.store import output, writes_file
+from twin.store import output, write_text, writes_file
 from twin.types import Form, Frame
 
 DARK_CAPS = AppearanceSpec(skin_albedo=(0.4, 0.4, 0.4), pin_albedo=(0.4, 0.4, 0.4), cap_albedo=(0.03, 0.03, 0.03))
@@ -39,6 +39,8 @@ LIMIT = 40
 """Number of frames, evenly spread, from which the specification is made: enough contacts to estimate the pins at rest."""
 JUDGED = 40
 """Number of frames on which the result is evaluated."""
+FOUND_PINS = "pins.csv"
+"""Name of the file of the pins that were found, as a layout that the user can correct."""
 SHOWN_FRAMES = 4
 """Most frames whose overlay pictures are shown."""
 PINHOLE_MM, FISHEYE_MM = 45.0, 7.5
@@ -105,13 +107,12 @@ class Health:
     def lines(self) -> list[str]:
         """The same as lines of text."""
         lines = [
-            f"all pins in view found in {100 * self.all_pins:.1f} % of {self.frames} frames, {100 * self.found:.2f} % of all pins; "
-            f"{100 * self.valid:.0f} % of the frames are valid"
+            f"all pins in view found in {100 * self.all_pins:.1f} % of {format_count(self.frames, 'frames')}, "
+            f"{100 * self.found:.2f} % of all pins; {100 * self.valid:.0f} % of the frames are valid"
         ]
         if self.steadily_lost:
-            lines.append(
-                f"lost in most frames: pin {', '.join(map(str, self.steadily_lost))}; look for dirt, reflections or missing caps there"
-            )
+            lost = format_count(len(self.steadily_lost), f"pins lost in most frames: {', '.join(map(str, self.steadily_lost))}")
+            lines.append(f"{lost}; look for dirt, reflections or missing caps there")
         return lines + [f"not usable, for example: {reason}" for reason in self.reasons]
 
 
@@ -211,7 +212,7 @@ def new_sensor(
     if radius_mm is not None:
         require_radius(radius_mm)
     folder = sibling_folder(out, "new")
-    with output(folder, "index.html", "overlay-*.png"):
+    with output(folder, "index.html", "overlay-*.png", FOUND_PINS):
         recording = open_recording(frames_at(frames, table, no_contact), None, form)
         looked = evenly_read(recording, limit)
         odd = recording.notes()
@@ -222,7 +223,7 @@ def new_sensor(
         images = [pin_levels(image, polarity) for image in images]
         if (enough := int((best.there >= STEADY).sum())) < LEAST_PINS:
             raise FrameError(
-                f"{enough} pins are seen in most frames, as {best.pins.in_words()}: too few to fit a camera, which needs {LEAST_PINS}; "
+                f"most frames show too few pins ({enough}, as {best.pins.in_words()}) to fit a camera, which needs {LEAST_PINS}; "
                 "give frames in which more pins are visible, and do not threshold them if the light fades towards the rim"
             )
         given, names = recording.reference, [frame.name for frame in looked]
@@ -238,6 +239,7 @@ def new_sensor(
             ) from error
         start = _start_specification(out.stem, looked[0], best.pins, rest, frames.name, polarity)
         start = start if radius_mm is None else of_radius(start, radius_mm)
+        start = start if found.sure else start.alter(description=f"{start.description}. {UNSURE_LAYOUT}")
         with stage(progress, "camera"):
             sizes_px = _sizes(best, images) if looked[0].form == Form.RAW else None
             fitted, camera, others = _camera(start, np.where((best.there >= STEADY)[:, None], rest.pins_px, np.nan), rest.source, sizes_px)
@@ -251,6 +253,7 @@ def new_sensor(
         known, assumed, steps = _describe_result(sensor, found, rest, camera, others, tuned, health, recording, out)
         known, assumed = ((*known, size), assumed) if radius_mm is not None else (known, (size, *assumed))
         write_sensor(out, sensor, _comment(frames.name, found, rest), _notes(found, rest, camera))
+        _write_pins(folder / FOUND_PINS, best, (sensor.camera.cx_px, sensor.camera.cy_px))
         with stage(progress, "assumptions") as step:
             costs = tuple(cost_of_assumptions(sensor, progress=step))
         files = [out, folder / "index.html"]
@@ -273,17 +276,20 @@ def _compare_layout(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
         dark = score_layout(layout, [pin_levels(image, "dark") for image in images])
         if dark is not None and (shown is None or dark.explained > shown.explained):
             shown, polarity = dark, "dark"
-    if shown is not None and shown.explained >= GIVEN_SHOWN:
+    other: Candidate | None = None
+    if shown is None or shown.explained < (GIVEN_SHOWN if alone else SURE_EXPLAINED):
+        try:
+            other = identify(images).best
+        except FrameError:
+            other = None
+    ahead = other is not None and shown is not None and other.explained > shown.explained + SURE_AHEAD
+    if shown is not None and shown.explained >= GIVEN_SHOWN and not ahead:
         forgotten = unnamed_spots(shown.rest_px, shown.seen) if alone else []
         doubts = tuple(
             f"a pin-like spot at ({x:.0f}, {y:.0f}) px is none of the {layout.in_words()}: is its position missing in the file?"
             for x, y in forgotten
         )
         return Identified((shown,), not doubts, doubts, 0.0, polarity)
-    try:
-        other = identify(images).best
-    except FrameError:
-        other = None
     if shown is None or shown.explained < LEAST_SHOWN:
         instead = f"; they show {other.pins.in_words()}" if other is not None else ""
         places = (
@@ -292,10 +298,10 @@ def _compare_layout(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
             else "give each pin's place, `layout` positions:FILE.csv"
         )
         raise FrameError(f"none of {len(images)} frames shows {layout.in_words()}{instead}; leave `layout` out to identify it, or {places}")
-    doubt = f"{layout.in_words()} were given, but explain only {100 * shown.explained:.1f} % of the spots"
+    doubt = f"{layout.in_words()} were given, but explain only {100 * shown.explained:.1f} % of the spots: {shown.differences()}"
     if other is None or other.explained <= shown.explained:
         return Identified((shown,), False, (f"{doubt}; check in the overlay whether these are all pins",), 0.0, polarity)
-    doubt += f"; {other.pins.in_words()} explain {100 * other.explained:.1f} %: leave `layout` out, or correct it"
+    doubt += f"; {other.pins.in_words()} explain {100 * other.explained:.1f} %: {other.differences()}"
     return Identified((shown, other), False, (doubt,), 0.0, polarity)
 
 
@@ -453,7 +459,7 @@ def _health(sensor: SensorSpec, form: Form, frames: list[Frame], folder: Path) -
     scale = int(np.clip(round(900 / max(pipeline.size_px)), 1, 6))  # pins can be seen well
     for k in list(chosen)[:SHOWN_FRAMES]:
         path = folder / f"overlay-{len(pictures) + 1}.png"
-        write_image(path, draw_overlay(frames[k], seen[k], scale=scale))
+        write_image(path, draw_overlay(frames[k], seen[k], scale=scale, numbers=True))
         pictures.append(path)
     return health, pictures
 
@@ -474,7 +480,7 @@ def _doubtful(camera: CameraReport, rest: Rest, frames: int) -> list[str]:
             "without contact: check the layout's positions, and whether that frame shows a contact"
         )
     if frames < FEW_FRAMES:
-        notes.append(f"{frames} frames are few: kind and focal length of the camera are unsure; give about {LIMIT}, of different contacts")
+        notes.append(f"too few frames ({frames}): camera and focal length are unsure; give about {LIMIT}, of different contacts")
     return notes
 
 
@@ -515,9 +521,13 @@ def _describe_result(
         *camera.held.values(),
     ]
     steps = []
-    if not found.sure and len(found.candidates) > 1:
+    if not found.sure:
+        layouts = ", or ".join(candidate.pins.in_words() for candidate in found.candidates[:2])
+        copy = out.with_name(f"{out.stem}-{FOUND_PINS}")
         steps.append(
-            f"decide between the layouts: {found.best.pins.in_words()}, or {found.candidates[1].pins.in_words()}; count them in the overlay"
+            f"decide whether the pins are {layouts}: look at the places above in the overlay. If not, copy "
+            f"{sibling_folder(out, 'new') / FOUND_PINS} to {copy}, remove pins that do not exist, add those that lack, and give the file: "
+            f"twin new {recording.path} --layout positions:{copy} --out {out}"
         )
     if rest.source != "given":
         steps.append("record a frame without contact and run this again with `no_contact` FRAME")
@@ -545,6 +555,18 @@ def _size(sensor: SensorSpec, *, given: bool) -> str:
         f"assumed: {size}, as a printed TacTip. Frames do not determine lengths in mm. If your tip differs, give its radius (`radius_mm`): "
         "otherwise lengths, forces and poses are wrong"
     )
+
+
+def _write_pins(path: Path, layout: Candidate, axis_px: tuple[float, float]) -> None:
+    """Write the pins of a layout, and spots that are none of them, as positions that can be corrected and given as a layout."""
+    lines = ["# x,y of each pin from the sensor's axis, px; y down. 'twin new' takes the file as --layout positions:FILE.csv"]
+    spots = unnamed_spots(layout.rest_px, layout.seen)
+    for k, (x, y) in enumerate([*layout.rest_px, *spots]):
+        what = "a spot that is none of the pins"
+        if k < layout.pins.count:
+            what = f"pin {k}" + (", not seen in most frames" if layout.there[k] < STEADY else "")
+        lines += [f"# {what}, at ({x:.0f}, {y:.0f}) px of the frame", f"{x - axis_px[0]:.2f},{y - axis_px[1]:.2f}"]
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def _comment(source: str, found: Identified, rest: Rest) -> str:
@@ -600,8 +622,10 @@ def _write_page(path: Path, made: NewSensor, pictures: list[Path]) -> None:
     )
     page.section("How to find out more")
     page.items(made.next_steps)
-    page.section("Pins in the frames", "Green: found. Red: a lost pin's expected place. Yellow: spots that are no pins.")
-    page.figures(*(PagePicture(path, f"Frame with its pins, {path.stem}", "", kind="photo") for path in pictures), layout="row")
+    page.section(
+        "Pins in the frames", "Green: found, with the pin's number. Red: a lost pin's expected place. Yellow: spots that are no pins."
+    )
+    page.figures(*(PagePicture(path, f"Frame with its pins, {path.stem}", "", kind="photo") for path in pictures))
     page.section("Layouts that were considered")
     page.table(
         [

@@ -23,7 +23,7 @@ from twin.calibration.light.surroundings import fit_surroundings
 from twin.calibration.sensor_file import sibling_folder, write_sensor
 from twin.camera.capture import expose
 from twin.camera.projection import lens_disc
-from twin.errors import FrameError
+from twin.errors import FrameError, format_count
 from twin.evaluation.pictures.aligned import Aligned, read_frames, with_changes
 from twin.evaluation.pictures.images import compare_images, difference_picture
 from twin.evaluation.pictures.report import image_columns
@@ -177,7 +177,7 @@ def calibrate_optics(
     folder = sibling_folder(out, "calibration")
     with output(folder, "index.html", "pictures", KEPT):
         found = fit_optics(frames, sensor, folder, limit=limit, no_contact=no_contact, progress=progress)
-        comment = [f"Fitted to {len(found.frames)} frames of {frames.name}, starting from {sensor.name}.", *found.warnings]
+        comment = [f"Fitted to {format_count(len(found.frames), 'frames')} of {frames.name}, starting from {sensor.name}.", *found.warnings]
         write_sensor(out, found.spec, "\n".join(comment))
         return OpticsCalibration(found, [out, write_page(folder, sensor, found, frames.name)])
 
@@ -228,7 +228,7 @@ def fit_optics(
         notes.append(f"the relief of {unseen} of {spec.pins.count} caps: fewer than two frames show them; use more frames")
     if len(frames) < FEW_FRAMES_FITTED:
         notes.append(
-            f"what moves with a cap and what does not: {len(frames)} frames hardly distinguish them; give {FRAMES} of different contacts"
+            f"too few frames ({len(frames)}) to distinguish what moves with a cap and what does not; give {FRAMES} of different contacts"
         )
     if spec.pipeline.raw.rest_origin == "contacts":
         notes.append(REST_MADE)
@@ -337,7 +337,7 @@ def write_page(out: Path, start: SensorSpec, found: Calibration, source: str) ->
     """Write ``index.html`` and its pictures to the folder ``out``, and return the page's path."""
     rows = _write_pictures(out / "pictures", found)
     lead = (
-        f"{len(rows)} frames of {source}. Figures are over the lens disc, of renders without noise, the skin fitted to each frame's pins."
+        f"{format_count(len(rows), 'frames')} of {source}. Figures: over the lens disc, renders without noise, the skin fitted to the pins."
     )
     page = Page(f"Calibration of {found.spec.name}", "twin calibrate", topic="TacTip twin: calibration", lead=lead)
     figures: list[dict[str, object]] = [{"of": "before", **found.before}, {"of": "after", **found.after}]

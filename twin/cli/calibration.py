@@ -140,7 +140,9 @@ def new_sensor(
     if (frames is None) == (not camera):
         raise OptionError("give either a folder of frames or `camera`")
     if frames is None:
-        frames = record_frames(open_camera(camera), out.with_name(f"{out.stem}-frames"), progress=progress).folder
+        recorded = record_frames(open_camera(camera), out.with_name(f"{out.stem}-frames"), progress=progress)
+        print_lines(recorded.lines()[:-1])
+        frames = recorded.folder
     return call(whole_sensor, locals(), layout=load_if_named(layout_from, layout))
 
 

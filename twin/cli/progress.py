@@ -69,9 +69,10 @@ class Bars:
 
 
 class Lines:
-    """A line of text every ``every_s`` seconds, for log files and pipes. Work that ends sooner says nothing.
+    """A line of text for each stage, and for each tenth of it, for log files and pipes; at most one every ``every_s`` seconds.
 
-    Within its context a line is also printed where nothing is reported for that long, so a log shows that the program is at work.
+    Work that ends sooner says nothing, and no line comes twice. Within its context a line is also printed where nothing is reported for so
+    long, so a log shows what the program is doing.
 
     Parameters
     ----------
@@ -84,23 +85,26 @@ class Lines:
     def __init__(self, out: TextIO, *, every_s: float = LINE_S, clock: Callable[[], float] = time.monotonic) -> None:
         self._out, self._every_s, self._clock = out, every_s, clock
         self._last_s = clock()
-        self._line = ""
+        self._line, self._part, self._told = "at work", ("", 0), ("", -1)
         self._turn = threading.Lock()
         self._over = threading.Event()
 
     def __call__(self, stage: str, done: float, total: float, note: str = "") -> None:
         far = "" if total <= 0 else f" {done:.0%}" if total <= 1 else f" {done:.0f} of {total:.0f}"
+        self._part = stage, int(10 * done / total) if total > 0 else -1
         self._line = f"{stage}:{far or ' begun'}{f', {note}' if note else ''}"
         self._print_if_due()
 
     def _print_if_due(self) -> float:
-        """Print how far the work is if the last line is old; the seconds until the next line is due."""
+        """Print how far the work is if the last line is old and of another part; the seconds until the next line is due."""
         with self._turn:
             passed_s = self._clock() - self._last_s
             if passed_s >= self._every_s:
                 self._last_s += passed_s
                 passed_s = 0.0
-                print(self._line or "at work", file=self._out, flush=True)
+                if self._part != self._told:
+                    self._told = self._part
+                    print(self._line, file=self._out, flush=True)
             return self._every_s - passed_s
 
     def _watch(self) -> None:

@@ -132,7 +132,7 @@ class Recording:
         alike: dict[str, list[str]] = {}
         for bad in self.failed:
             alike.setdefault(bad["reason"], []).append(bad["image_name"])
-        skipped = {said: names[0] if len(names) == 1 else describe_count(len(names), "frames", names) for said, names in alike.items()}
+        skipped = {said: names[0] if len(names) == 1 else describe_count("frames", names) for said, names in alike.items()}
         return [*self.problems, *(f"skipped {named}: {said}" for said, named in skipped.items())]
 
     def labels_found(self) -> str:

@@ -3,7 +3,7 @@
 import csv
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from scenes.files import read_regular
-from twin.errors import FrameError
+from twin.errors import FrameError, format_count
 from twin.frames.folders import IMAGE_SUFFIXES
 
 # Names of a recording's table, in the order in which they are tried.
@@ -131,12 +131,12 @@ def read_table(path: Path, problems: list[str], *, otherwise: str = "frames are 
         return None
     ragged = sum(len(row) != len(header) for row in rows[1:])
     if ragged:
-        problems.append(f"{path.name}: {ragged} rows don't have the header's {len(header)} cells and are left out")
+        problems.append(f"{path.name}: {format_count(ragged, 'rows')} without the header's {len(header)} cells, left out")
     if _is_truncated(text, rows[1:]):
         problems.append(f"{path.name}: it ends within its last row, before the last number; copy it again")
     distinct = _distinct(header)
     if renamed := [new for new, old in zip(distinct, header, strict=True) if new != old]:
-        problems.append(f"{path.name}: {describe_count(len(renamed), 'columns have the name of another', renamed)}")
+        problems.append(f"{path.name}: {describe_count('columns with the name of another', renamed)}")
     rows = [row for row in rows[1:] if len(row) == len(header)]
     columns = {column: [row[k] for row in rows] for k, column in enumerate(distinct) if column}
     return LabelTable(path.name, columns, [[base_name(row[k]) for row in rows] for k in name_columns])
@@ -167,9 +167,9 @@ def _is_truncated(text: str, rows: list[list[str]]) -> bool:
     return not ended and last and not all(above or [False])
 
 
-def describe_count(count: int, things: str, names: list[str]) -> str:
-    """Number and kind of things, with the names of the first three."""
-    return f"{count} {things} ({', '.join(names[:3])}{', ...' if count > 3 else ''})"
+def describe_count(things: str, names: Sequence[str] | np.ndarray) -> str:
+    """Number and kind of things, as for ``format_count``, with the names of the first three."""
+    return f"{format_count(len(names), things)} ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})"
 
 
 @dataclass
@@ -232,14 +232,14 @@ def order_by_table(tables: list[Path], files: list[Path], problems: list[str]) -
     named = set(pairing.files.values())
     unlisted = [file for file in files if file not in named]
     odd = {
-        "rows name a picture with another suffix or case": pairing.loose,
+        "rows for a picture with another suffix or case": pairing.loose,
         "rows for a picture that has one before, left out": pairing.doubled,
         "rows without a picture": pairing.missing,
     }
-    problems += [f"{table.name}: {describe_count(len(rows), what, [names[k] for k in rows])}" for what, rows in odd.items() if rows]
+    problems += [f"{table.name}: {describe_count(what, [names[k] for k in rows])}" for what, rows in odd.items() if rows]
     if unlisted:
         what = "pictures without a row, placed after the others"
-        problems.append(f"{table.name}: {describe_count(len(unlisted), what, [p.name for p in unlisted])}")
+        problems.append(f"{table.name}: {describe_count(what, [p.name for p in unlisted])}")
     rows = sorted(pairing.files)
     labels = {c: _as_array([cells[k] for k in rows] + [""] * len(unlisted)) for c, cells in table.columns.items()}
     return [pairing.files[k] for k in rows] + unlisted, called_here(labels)

@@ -215,7 +215,7 @@ class Pad(SkinShape):
     def _check_flat(self, feet_mm: FloatArray, on_flat: BoolArray) -> tuple[FloatArray, FloatArray]:
         if not on_flat.all():
             raise SpecError(
-                f"{np.count_nonzero(~on_flat)} pins stand beyond the flat part of the pad; make pins.reach_mm smaller, or turn the layout"
+                f"pins beyond the flat part of the pad: {np.count_nonzero(~on_flat)}; make pins.reach_mm smaller, or turn the layout"
             )
         outward = np.tile([0.0, 0.0, 1.0], (len(feet_mm), 1))
         return np.column_stack([feet_mm, np.full(len(feet_mm), -self.skin.thickness_mm)]), outward

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.errors import FrameError
+from twin.errors import FrameError, format_count
 from twin.frames import Recording, open_recording
 from twin.frames.forms import blob_spec, gray_levels
 from twin.frames.images import write_image
@@ -57,9 +57,9 @@ MADE_OF_CONTACTS = "made from contacts"
 """Text instead of a no-contact frame's name if the reference is the specification's places at rest that were estimated from contacts."""
 FARTHEST_PX = 1e4
 """Largest distance of a drawn point from the frame's origin, px. OpenCV's integers would overflow beyond it."""
-HALF, BRIGHTEST, DARKEST = 127.0, 98.0, 24.0
-"""Brightness of a picture: the gray level ``HALF`` that is given to the frame's level at the percentile ``BRIGHTEST``. That level counts as
-``DARKEST`` at least. The frame is shown at half brightness, so that the drawing on it is visible."""
+HALF, BRIGHTEST, DARKEST = 127.0, 98.0, 12.0
+"""Brightness of a picture: the gray level ``HALF`` that is given to the frame's level at the percentile ``BRIGHTEST``, between the pins if
+some are found. That level counts as ``DARKEST`` at least. The frame is shown at half brightness, so that the drawing on it is visible."""
 UNMEASURED = "specification"
 """Text instead of the name of a no-contact frame if the reference is the specification's layout."""
 
@@ -90,7 +90,7 @@ class Preprocessed(ReadableResult):
             f"all {pins} pins" if in_view == pins else f"all pins in view ({in_view:g} of {pins}; the picture's border cuts the others off)"
         )
         yield (
-            f"{summary['frames']} frames, {which} found in {100 * summary['exact_fraction']:.2f} %, "
+            f"{format_count(summary['frames'], 'frames')}, {which} found in {100 * summary['exact_fraction']:.2f} %, "
             f"{summary['ms']['total']['p50']:.2f} ms per frame (median)"
         )
         yield from (f"not valid {invalid['image_name']}: {invalid['reason']}" for invalid in summary["invalid"])
@@ -215,10 +215,17 @@ def recording_reference(spec: SensorSpec, recording: Recording, problems: list[s
     return nominal_reference(spec, recording.form), UNMEASURED
 
 
-def draw_overlay(frame: Frame, observation: Observation, *, scale: int = 2) -> np.ndarray:
-    """Picture (H, W, 3) uint8 RGB: frame, graph, found pins (green), predicted places of lost pins (red), rejected blobs (yellow)."""
+def draw_overlay(frame: Frame, observation: Observation, *, scale: int = 2, numbers: bool = False) -> np.ndarray:
+    """Picture (H, W, 3) uint8 RGB: frame, graph, found pins (green), predicted places of lost pins (red), rejected blobs (yellow).
+
+    With ``numbers`` each pin has its number beside it.
+    """
     image = cv2.resize(frame.image, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
-    light = HALF / max(float(np.percentile(gray_levels(image), BRIGHTEST)), DARKEST)  # a dark frame is shown lighter
+    gray, found_px = gray_levels(frame.image), observation.pins_px[np.isfinite(observation.pins_px[:, 0])]
+    if len(found_px):  # a bright housing around the pins must not make them dark
+        (left, top), (right, bottom) = np.maximum(found_px.min(axis=0), 0).astype(int), np.ceil(found_px.max(axis=0)).astype(int)
+        gray = gray[top : bottom + 1, left : right + 1]
+    light = HALF / max(float(np.percentile(gray, BRIGHTEST)), DARKEST)  # a dark frame is shown lighter
     canvas = np.minimum(image.reshape(*image.shape[:2], -1) * light, HALF).astype(np.uint8)
     canvas = np.repeat(canvas, 3, axis=2) if canvas.shape[2] == 1 else canvas
 
@@ -232,7 +239,11 @@ def draw_overlay(frame: Frame, observation: Observation, *, scale: int = 2) -> n
             if i < j:
                 cv2.line(canvas, nodes[i], nodes[j], EDGE_RGB, 1, cv2.LINE_AA)
     for px in place(observation.pins_px):
-        cv2.circle(canvas, px, 2, FOUND_RGB, -1, cv2.LINE_AA)
+        cv2.circle(canvas, px, max(2, scale), FOUND_RGB, -1, cv2.LINE_AA)
+    both_px = np.where(np.isfinite(observation.pins_px), observation.pins_px, observation.predicted_px)
+    for pin in np.flatnonzero(np.isfinite(both_px).all(axis=1)) if numbers else ():
+        ((x, y),) = place(both_px[[pin]])
+        cv2.putText(canvas, str(pin), (x + 5, y - 4), cv2.FONT_HERSHEY_SIMPLEX, 0.35, (255, 255, 255), 1, cv2.LINE_AA)
     for px in place(observation.predicted_px):
         cv2.circle(canvas, px, 5, LOST_RGB, 1, cv2.LINE_AA)
     for px in place(observation.extra_px):

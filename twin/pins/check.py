@@ -258,7 +258,7 @@ def _spots(seen: list[Observation], pipeline: Pipeline) -> Finding:
         hits = np.array([[len(p) and cKDTree(p).query(spot)[0] < within for p in places] for spot in places[0]], float)
         steady = int((hits.mean(axis=1) >= STEADY).sum())
     kind = pipeline.blob_spec.polarity
-    return _finding("specks", steady / len(pipeline.reference.pins_px), f"{steady} steady {kind} spots among the pins")
+    return _finding("specks", steady / len(pipeline.reference.pins_px), f"steady {kind} spots among the pins: {steady}")
 
 
 def _place(seen: list[Observation], nominal: Reference, spec: SensorSpec) -> list[Finding]:

@@ -57,7 +57,7 @@ class Graphs(ReadableResult):
     def lines(self) -> list[str]:
         """The result as lines of text: irregularities, frames left out, and the size of the first graph."""
         first = self.graphs[0]
-        counted = f"{len(self.graphs)} graphs; the first has {len(first.nodes_px)} nodes and {len(first.edges)} directed edges"
+        counted = f"graphs: {len(self.graphs)}; the first has {len(first.nodes_px)} nodes and {len(first.edges)} directed edges"
         return [*(f"note: {note}" for note in self.notes), *(f"skipped {reason}" for reason in self.left_out), counted]
 
 

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from scenes.sensor import BlobSpec, SensorSpec
 from twin.compiled import compiled
-from twin.errors import FrameError
+from twin.errors import FrameError, format_count
 from twin.frames.forms import blob_spec, form_named, frame_size, pin_levels
 from twin.pins.finding.blobs import Blobs, Mask, circular_mask, despeckle, find_blobs, find_spots, own_threshold
 from twin.pins.flips import Net
@@ -149,7 +149,7 @@ class Pipeline:
             )
         if not reason and (unnamed := self._count_unnamed(blobs, found, nodes_px)) >= LEAST_UNNAMED <= lost:
             reason = (
-                f"ambiguous pins: {unnamed} blobs continue the rows of pins, and {lost} pins are lost: the picture is torn, or part is "
+                f"ambiguous pins: blobs continue the rows of pins ({unnamed}), and pins are lost ({lost}): the picture is torn, or part is "
                 "labelled a row apart; take the frame again, or cover what looks like pins"
             )
         if not reason and between > MOST_BETWEEN:
@@ -347,7 +347,7 @@ class Pipeline:
     def _reason(self, blobs: Blobs, found: int, n: int, nodes_px: np.ndarray, extra_px: np.ndarray) -> str:
         """Reason why a frame with ``n`` pins in view is not a valid observation; "" if it is valid."""
         if len(blobs.px) < MIN_FOUND * n / 2:
-            return f"no pins: {len(blobs.px)} blobs seen, {n} pins expected"
+            return f"no pins: {format_count(len(blobs.px), 'blobs')} seen, {n} pins expected"
         if found < MIN_FOUND * n:
             return f"too few pins: {found} of {n} found among {len(blobs.px)} blobs, {MIN_FOUND:.0%} needed"
         folded = folded_fraction(self.reference, nodes_px)

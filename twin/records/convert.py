@@ -183,7 +183,7 @@ class Converted(ReadableResult):
     def lines(self) -> list[str]:
         """The result as lines of text."""
         new = f" ({self.episodes - self.before} new)" if self.before else ""
-        return [*(f"note: {note}" for note in self.notes), f"{self.episodes} episodes, {self.steps} frames{new} as {self.to}"]
+        return [*(f"note: {note}" for note in self.notes), f"episodes: {self.episodes}, frames: {self.steps}{new} as {self.to}"]
 
 
 @writes(gone_on=tuple(dict.fromkeys((SIDECAR, RESTS, *(name for each in WRITERS.values() for name in each.NAMES)))))

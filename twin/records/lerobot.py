@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import cv2
 import numpy as np
 
-from twin.errors import ErrorsAs, FrameError, library
+from twin.errors import ErrorsAs, FrameError, format_count, library
 from twin.frames import open_recording
 from twin.frames.lerobot import COUNTERS
 from twin.frames.videos import describe_pauses
@@ -170,7 +170,7 @@ class LeRobotWriter(FolderWriter):
         if not self._off:
             return []
         most_s, key, pauses = max(self._off)
-        where = f"{len(self._off)} episodes, by up to {most_s:.3g} s in {key}{f' ({pauses})' if pauses else ''}"
+        where = f"{format_count(len(self._off), 'episodes')}, by up to {most_s:.3g} s in {key}{f' ({pauses})' if pauses else ''}"
         stamp = f"timestamp, as LeRobot defines it (frame number / {self.rate_hz} fps), is more than half a frame off the true times in"
         return [f"{stamp} {where}; the true times are in {TIME}"]
 

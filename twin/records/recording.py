@@ -168,7 +168,7 @@ def _take_out_moves(path: Path, recording: Recording, values: dict[str, np.ndarr
     known = read_executed(path, recording.names, notes)
     executed = np.array([known.get(name, 1.0) for name in recording.names], np.float32)
     if count := np.count_nonzero(executed != 1):
-        notes.append(f"the moves of {count} frames were not, or not certainly, executed: they are removed from poses and moves")
+        notes.append(f"moves that were not, or not certainly, executed ({count}) are removed from poses and moves")
         values["pose"], values["move"] = as_executed(values["pose"], values["move"], executed)
 
 

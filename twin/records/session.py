@@ -20,7 +20,7 @@ from pydantic import BaseModel, ValidationError
 from scenes import load_experiment, load_sensor
 from scenes.base import Name, SpecError
 from scenes.files import quote, read_regular
-from twin.errors import ErrorsAs, FrameError, StoreError
+from twin.errors import ErrorsAs, FrameError, StoreError, format_count
 from twin.frames.forms import times
 from twin.frames.images import read_image, write_image
 from twin.frames.videos import describe_pauses
@@ -148,7 +148,7 @@ def _steps_and_note(folder: Path) -> tuple[list[dict], str]:
             break
         steps.append(step)
     whole = len(steps) == len(lines) - 1 and not lines[-1]
-    return steps, "" if whole else f"{STEPS}: line {len(steps) + 1} is cut or damaged; the {len(steps)} steps before it are read"
+    return steps, "" if whole else f"{STEPS}: line {len(steps) + 1} is cut or damaged; the lines before it are read"
 
 
 class Session:
@@ -185,7 +185,7 @@ class Session:
         checked = [self._check_step(number, step) for number, step in enumerate(self.steps, 1)]
         self._lines, self._decided_s = [line.frame for line in checked], [line.time_s for line in checked]
         loose = {path.name for path in (self.folder / FRAMES).glob("*.png")} - {line.file for line in self._lines}
-        loose_note = f"{len(loose)} pictures in {FRAMES}/ have no step in {STEPS}: the session was interrupted" if loose else ""
+        loose_note = f"{FRAMES}/ has pictures without a step in {STEPS} ({len(loose)}): the session was interrupted" if loose else ""
         self.notes = [each for each in (note, loose_note) if each]
         self.form = self._lines[0].form
 
@@ -230,7 +230,7 @@ class Session:
         numbers, times_s = sorted(used), [used[number] for number in sorted(used)]
         unread, again = numbers[-1] - numbers[0] + 1 - len(numbers), len(self._lines) - len(numbers)
         found = [describe_pauses(times_s)]
-        found += [f"{unread} frames of the camera between the recorded ones are not in the session"] if unread > 0 else []
+        found += [f"{format_count(unread, 'frames')} of the camera between the recorded ones, not in the session"] if unread > 0 else []
         found += [f"{again} of {len(self._lines)} steps use the same frame as the step before them"] if again else []
         return [f"{self.folder.name}: {each}" for each in found if each]
 

@@ -77,7 +77,7 @@ def read_arm_labels(recording: Recording, experiment: ExperimentSpec | None = No
     odd = ~np.isfinite(np.hstack([values["pose"], values["move"]])).all(axis=1)
     if odd.any():
         names = [recording.names[k] for k in np.flatnonzero(odd)[:3]]
-        raise FrameError(f"{recording.path}: {odd.sum()} rows hold no number in a pose or move ({', '.join(names)}); repair or remove them")
+        raise FrameError(f"{recording.path}: rows without a number in a pose or move ({', '.join(names)}); repair or remove them")
     if experiment is not None and (fixed := _varied_beyond(experiment, values)):
         recording.problems.append(
             f"{', '.join(fixed)} varies in the table, and not in the experiment {experiment.name}: what is simulated by this experiment "
@@ -172,16 +172,16 @@ def _pair_shares(file: str, listed: list[str], shares: list[float], names: Seque
         found.pop(same.get(bare_name(listed[row]), ""), None)
     unreadable = [row for row, share in enumerate(shares) if np.isnan(share)]
     odd = {
-        "rows hold no number from 0 to 1, no true or false and no yes or no, and are not used": unreadable,
-        "rows contradict an earlier row of the same frame, and neither is used": contradicting,
-        "rows name no frame here": pairing.missing,
-        "rows name a frame with another suffix or case": pairing.loose,
-        "rows repeat an earlier row": [row for row in pairing.doubled if row not in contradicting],
+        "rows without a number from 0 to 1, true or false, or yes or no, not used": unreadable,
+        "rows against an earlier row of the same frame, neither used": contradicting,
+        "rows for no frame here": pairing.missing,
+        "rows for a frame with another suffix or case": pairing.loose,
+        "rows like an earlier row": [row for row in pairing.doubled if row not in contradicting],
     }
-    problems += [f"{file}: {describe_count(len(rows), what, [listed[k] for k in rows])}" for what, rows in odd.items() if rows]
+    problems += [f"{file}: {describe_count(what, [listed[k] for k in rows])}" for what, rows in odd.items() if rows]
     known = {name: share for name, share in found.items() if not np.isnan(share)}
     if without := [name for name in names if name not in known]:
-        problems.append(f"{file}: {describe_count(len(without), 'frames have no usable row; their moves count as executed', without)}")
+        problems.append(f"{file}: {describe_count('frames without a usable row, counted as executed', without)}")
     return known
 
 

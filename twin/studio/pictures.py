@@ -81,7 +81,8 @@ def estimate_table(estimate: Estimate | None, truth: Mapping[str, float], *, mis
         known = name in truth
         kind = "" if not known else ("good" if low <= truth[name] <= high else "bad")
         true = f"{truth[name]:+.2f}" if known else "-"
-        cells = f"<td>{escape(', '.join(filter(None, (label, unit))))}</td><td>{value:+.2f}</td><td>{low:+.2f} to {high:+.2f}</td>"
+        named = label if label == name else f"{label} ({name})"  # its sign and zero are those of the recordings' column
+        cells = f"<td>{escape(', '.join(filter(None, (named, unit))))}</td><td>{value:+.2f}</td><td>{low:+.2f} to {high:+.2f}</td>"
         rows.append(f"<tr>{cells}<td class='{kind}'>{true}</td></tr>")
     head = "<tr><th>estimate</th><th>value</th><th>90 % interval</th><th>truth</th></tr>"
     return f"<table>{head}{''.join(rows)}</table>"

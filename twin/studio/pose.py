@@ -12,7 +12,7 @@ from twin.types import FloatArray
 LIMITS: dict[str, tuple[float, float, str]] = {
     "x_mm": (-20.0, 20.0, "farther from the axis the object does not reach the dome"),
     "y_mm": (-20.0, 20.0, "farther from the axis the object does not reach the dome"),
-    "depth_mm": (-10.0, 20.0, "the object's place above or below the tip"),
+    "depth_mm": (-10.0, 20.0, "the object's place below the tip at rest, positive where it presses"),
     "tilt_x_deg": (-60.0, 60.0, "the dome does not reach farther"),
     "tilt_y_deg": (-60.0, 60.0, "the dome does not reach farther"),
     "twist_deg": (-90.0, 90.0, "a quarter turn"),

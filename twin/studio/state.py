@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from scenes import load_object, load_sensor
 from scenes.base import NonNegative, Section, SpecError
 from scenes.files import read_regular
-from twin.errors import ErrorsAs, TwinError
+from twin.errors import ErrorsAs, TwinError, format_count
 from twin.store import text_file, write_json, writing
 from twin.studio.pictures import OverlayChoices
 from twin.studio.pose import NAMES, ObjectPose
@@ -182,7 +182,7 @@ def read_trajectory(content: bytes, name: str) -> Way:
     except (UnicodeDecodeError, ValueError, TypeError, csv.Error) as error:
         raise TwinError(f"{name}: no readable trajectory ({error}); expected a CSV table of numbers with {', '.join(COLUMNS)}") from error
     if not 0 < len(rows) <= MOST_ROWS:
-        raise TwinError(f"{name}: {len(rows)} rows; a trajectory has 1 to {MOST_ROWS}")
+        raise TwinError(f"{name}: {format_count(len(rows), 'rows')}; a trajectory has 1 to {MOST_ROWS}")
     times = [row.pop("time_s") for row in rows]
     if any(not later > earlier for earlier, later in zip(times, times[1:], strict=False)):
         raise TwinError(f"{name}: time_s does not increase; sort the rows by time")

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Generic, TypeVar
 
 from scenes.base import SpecError
-from twin.errors import TwinError
+from twin.errors import TwinError, format_count
 from twin.optics.preview import Shading
 from twin.studio.contact import ContactAnswer, Light, MovingContact
 from twin.studio.pose import ObjectPose
@@ -214,7 +214,7 @@ class Worker(_OwnThread):
                 self._moved_s = time.monotonic()
                 self.show_again()
             case Saved():
-                self._on_message(f"saved {outcome.written[0].parent} ({len(outcome.written)} files)")
+                self._on_message(f"saved {outcome.written[0].parent} ({format_count(len(outcome.written), 'files')})")
             case Failed():
                 if outcome.tracing:
                     self._traces = False

@@ -116,7 +116,7 @@ def fit_contact(setup: CalibrationSetup, measured: MeasuredFrames, *, progress: 
         There are too few frames, or none of their contacts can be simulated.
     """
     if len(measured) < FEWEST:
-        raise FrameError(f"{len(measured)} frames with pins are too few; give `num_labelled` {FEWEST} or more")
+        raise FrameError(f"too few frames with pins ({len(measured)}); give `num_labelled` {FEWEST} or more")
     target = measured.pins_px - measured.no_contact_px
     start, sign = _start(setup, measured, target, progress)
     prior = np.array([p.prior for p in setup.parameters])

@@ -82,7 +82,7 @@ def compare_forces(measured_n: ArrayLike, simulated_n: ArrayLike, sensor: Sensor
     usable = (measured >= LEAST_N) & (simulated >= LEAST_N / ASSUMED_FACTOR**2)
     count = int(usable.sum())
     if count < FEWEST_PRESSES:
-        return assume_stiffness(sensor, f"{count} presses with a force are too few")
+        return assume_stiffness(sensor, f"too few presses with a force ({count})")
     ratio = np.log(measured[usable] / simulated[usable])
     error = float(ratio.std(ddof=1) / np.sqrt(count) * student.ppf(COVERED, count - 1))
     scale, factor = float(np.exp(ratio.mean())), float(np.exp(error))

@@ -169,7 +169,7 @@ def fit_rig(
     """
     if len(labels) < FEWEST:
         raise FrameError(
-            f"{len(labels)} labelled frames are too few to fit the arm's rig to; give at least {2 * FEWEST}, half are for the test"
+            f"too few labelled frames ({len(labels)}) to fit the arm's rig to; give at least {2 * FEWEST}, half are for the test"
         )
     seen = np.isfinite(pins_px)
 

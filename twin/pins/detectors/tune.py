@@ -205,9 +205,8 @@ def other_layout(layout: Candidate, images: list[np.ndarray]) -> list[str]:
     smoother = other.explained > layout.explained - MORE_EXPLAINED and other.misfit < SAME_SHAPE * layout.misfit
     if not same and (more or smoother):
         return [
-            f"these frames show {_in_words(found)} rather than {layout.pins.in_words()}: {layout.left_over:g} pin-like spots of a "
-            f"frame are none of these pins, and {layout.not_seen:g} of the pins are not seen; give the right `sensor`, or make one with "
-            "'twin new'"
+            f"these frames show {_in_words(found)} rather than {layout.pins.in_words()}: {layout.differences()}; "
+            "give the right `sensor`, or make one with 'twin new'"
         ]
     if layout.explained < SURE_EXPLAINED:
         return [f"{layout.line()}; look at the frames: are there other pins, stray light or dirt?"]

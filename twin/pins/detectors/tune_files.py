@@ -102,7 +102,7 @@ def tune_on_frames(
         write_detector(
             out,
             found.detector,
-            f"Found by 'twin tune' from {len(frames)} frames of {recording.path.name}; {evidence.sure}. {found.rest.line()}.",
+            f"Found by 'twin tune' from frames of {recording.path.name} ({len(frames)}); {evidence.sure}. {found.rest.line()}.",
         )
     return TunedOnFrames(found, evidence, [] if out is None else [out], odd)
 

@@ -76,6 +76,8 @@ about 1 for pins and about 0 for gaps; and largest share of threes with a smalle
 seven sensors with bright and of one with dark pins, and as at least 0.44 for gaps of sampled layouts."""
 SMOOTHED = 0.5
 """Standard deviation of the smoothing before these heights are measured, in standard deviations of a spot."""
+MOST_PLACES = 6
+"""Most places that a message lists."""
 FEWEST_VIEWED = 12
 """Least number of pins to which a smooth view is fitted. The view has ten terms."""
 
@@ -130,6 +132,8 @@ class Candidate:
         Share of the frames in which each pin is seen.
     seen : tuple of Seen
         The layout's pins in each frame.
+    lost : tuple of int
+        Pins that are not seen in most frames, although they are in view.
     """
 
     pins: PinsSpec
@@ -141,13 +145,32 @@ class Candidate:
     rest_px: np.ndarray
     there: np.ndarray
     seen: tuple[LayoutInFrame, ...]
+    lost: tuple[int, ...] = ()
 
     def line(self) -> str:
         """The candidate in words."""
-        return (
-            f"{self.pins.in_words()}: explains {100 * self.explained:.1f} % of what is there; in a typical frame "
-            f"{self.not_seen:g} of its pins are not seen, and {self.left_over:g} pin-like spots are none of them"
-        )
+        return f"{self.pins.in_words()}: explains {100 * self.explained:.1f} % of what is there; {self.differences()}"
+
+    def differences(self) -> str:
+        """How the layout differs from most frames, in words: places where no pin is seen, and pin-like spots that are none of its pins."""
+        empty = np.concatenate([self.missing_px(), self.rest_px[list(self.lost)]])
+        spots = np.reshape(unnamed_spots(self.rest_px, self.seen), (-1, 2))
+        lacking = [f"no pin is seen at {_places(empty)}"] * bool(len(empty))
+        beyond = [f"pin-like spots that are none of its pins: at {_places(spots)}"] * bool(len(spots))
+        return "; ".join(lacking + beyond) or "most frames show all its pins, and no others"
+
+    def missing_px(self) -> np.ndarray:
+        """Where the missing pins of the complete layout would be, (k, 2) px: predicted from the others."""
+        complete = self.pins.model_copy(update={"missing": ()})
+        px = np.full((complete.count, 2), np.nan)
+        px[np.setdiff1d(np.arange(complete.count), self.pins.missing)] = self.rest_px
+        return smooth_view(pin_lattice(complete).places, px)[list(self.pins.missing)] if self.pins.missing else np.zeros((0, 2))
+
+
+def _places(px: np.ndarray) -> str:
+    """Places (k, 2), px, in words; the first ``MOST_PLACES``."""
+    more = f" and {len(px) - MOST_PLACES} more places" if len(px) > MOST_PLACES else ""
+    return ", ".join(f"({x:.0f}, {y:.0f})" for x, y in px[:MOST_PLACES]) + " px" + more
 
 
 @dataclass(frozen=True)
@@ -478,6 +501,7 @@ def _candidate(pins: PinsSpec, seen: list[LayoutInFrame], spots: list[Bumps], *,
         rest,
         there,
         tuple(again),
+        tuple(np.flatnonzero((there < STEADY) & shown).tolist()),
     )
 
 
@@ -614,8 +638,8 @@ def _doubts(found: list[Candidate]) -> list[str]:
     complete = best.pins.model_copy(update={"missing": ()})
     if at_rim := sorted(set(best.pins.missing) & set(pin_lattice(complete).outmost.tolist())):
         doubts.append(
-            f"pin {', '.join(map(str, at_rim[:5]))} at the rim is in no frame: missing, or too dark to be seen; look there in the "
-            "overlay, and give the layout"
+            f"no frame shows a pin of the rim at {_places(best.missing_px()[np.isin(best.pins.missing, at_rim)])}: missing, or too dark to "
+            "be seen; look there in the overlay, and give the layout"
         )
     for other in found[1:]:
         if other.explained > best.explained - SURE_AHEAD and (other.misfit == np.inf or best.misfit > SAME_SHAPE * other.misfit):

@@ -17,7 +17,7 @@ from twin.studio.modes.mode import PageMode
 from twin.studio.modes.twin_mode import TwinMode
 from twin.studio.page import ARCHIVES, StudioPage, put
 from twin.studio.pictures import CONTROLS, OverlayChoices, badge, camera_picture, cell_picture, number_table, paragraph
-from twin.studio.state import next_path
+from twin.studio.state import FIRST_DEPTH_MM, next_path
 
 LARGER, SMALLER = "one larger", "one smaller"
 """Corrections of a layout: one ring more or less, or for a grid one row and one column."""
@@ -141,7 +141,7 @@ class NewMode(PageMode):
         self.propose()
 
     def use(self) -> None:
-        """Use the proposed sensor in the mode 'Twin'.
+        """Use the proposed sensor in the mode 'Twin', in contact.
 
         Raises
         ------
@@ -149,7 +149,7 @@ class NewMode(PageMode):
             Nothing has been proposed yet.
         """
         written = str(self._proposal().written[0])
-        self._twin.open(self._twin.state.alter(sensor=written, form="raw", pose={}))
+        self._twin.open(self._twin.state.alter(sensor=written, form="raw", pose={"depth_mm": FIRST_DEPTH_MM}))
         self._page.choose(self._twin.title)
 
     def _proposal(self) -> NewSensor:

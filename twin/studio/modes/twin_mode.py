@@ -533,7 +533,7 @@ class TwinMode(PageMode):
         way, self._path = self._path, None
         if way:
             kept = [pair for k, pair in enumerate(way) if k == 0 or pair[0] > way[k - 1][0]]
-            self._page.say(f"saved {save_trajectory(next_path(self._out, 'trajectory', '.csv'), kept)} ({len(kept)} poses)")
+            self._page.say(f"saved {save_trajectory(next_path(self._out, 'trajectory', '.csv'), kept)} (poses: {len(kept)})")
 
     def _toggle_film(self) -> None:
         if self._filming.value:

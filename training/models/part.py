@@ -253,6 +253,8 @@ class Model(ABC):
         Whether it has ``modes``, so that a Gaussian process can be averaged with its networks.
     modes_scaled : bool
         Whether the scales of its modes show their importance, so that the process needs only one common length.
+    derived : tuple of str, optional
+        Weights that a small copy leaves out, because ``build`` makes them again. None: the model has no small copy.
     """
 
     name: str
@@ -265,6 +267,7 @@ class Model(ABC):
     counts_from_rest: ClassVar[bool] = False
     has_modes: ClassVar[bool] = False
     modes_scaled: ClassVar[bool] = False
+    derived: ClassVar[tuple[str, ...] | None] = None
 
     @abstractmethod
     def prepare(self, data: Dataset, train: np.ndarray) -> Prepared:
@@ -345,17 +348,13 @@ class Model(ABC):
         TrainingError
             The model has no small copy.
         """
-        raise TrainingError(f"{self.name} has no small copy: the effect of half precision on it was never measured")
+        if self.derived is None:
+            raise TrainingError(f"{self.name} has no small copy: the effect of half precision on it was never measured")
+        return {key: value for key, value in weights.items() if key not in self.derived}
 
     def unpack(self, packed: Weights, blank: Weights) -> Weights:
-        """The weights of a network from its small copy ``packed``; ``blank`` are the weights of the network that ``build`` makes.
-
-        Raises
-        ------
-        TrainingError
-            The model has no small copy.
-        """
-        raise TrainingError(f"{self.name} has no small copy")
+        """The weights of a network from its small copy ``packed``; ``blank`` are the weights of the network that ``build`` makes."""
+        return packed | {key: blank[key] for key in self.derived or ()}
 
 
 class PinModel(Model):

@@ -223,9 +223,7 @@ def fit(sensor: SensorSpec, solved: Sequence[SolvedPath], start: Surrogate, *, p
     about = {"sensor": sensor.name, "mechanics": mechanics_of(sensor), "domain": domain, "paths": len(solved)}
     about |= {"states": int(sum(len(path.T) for path in solved))}
     answer, on_pins, read = (values.astype(np.float32) for values in (answer, on_pins, read))
-    made = replace(
-        start, about=about, node_mm=skin.node_mm, answer=answer, modes=on_pins, read=read, bending=bending, layers=layers
-    )
+    made = replace(start, about=about, node_mm=skin.node_mm, answer=answer, modes=on_pins, read=read, bending=bending, layers=layers)
     made = made.as_kept()  # so that the errors are those of the file, which rounds the arrays
     about["errors"] = measure_errors(made, sensor, kept)
     return made

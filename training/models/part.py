@@ -208,10 +208,6 @@ class Trained:
     ensemble: Callable[[Inputs, torch.Tensor], Prediction]
     touched: Callable[[np.ndarray, np.ndarray], float] | None = None
 
-    def contact_probability(self, nodes_px: np.ndarray, lost: np.ndarray) -> float:
-        """Probability that pins (N, 2), of which some are ``lost`` (N,), show a contact; NaN if it is unknown."""
-        return float("nan") if self.touched is None else self.touched(nodes_px, lost)
-
 
 @dataclass(frozen=True)
 class Variant:
@@ -410,7 +406,7 @@ class PinModel(Model):
         if not seen.valid or seen.graph is None:
             return Unseen(seen.reason, seen=seen)
         lost = np.isnan(seen.pins_px[:, 0])
-        touched = trained.contact_probability(seen.graph.nodes_px, lost)
+        touched = float("nan") if trained.touched is None else trained.touched(seen.graph.nodes_px, lost)
         if touched < LIKELY:
             return Unseen(f"no contact (its probability is {touched:.0%})", touched, seen)
         reference = trained.pipeline.reference

@@ -13,7 +13,7 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
-from hardware.arms.kinematics import FARTHEST, LinkageKinematics, joint_target, linear_target
+from hardware.arms.kinematics import FARTHEST, Kinematics, joint_target, linear_target
 from hardware.arms.motion import turn_between_deg
 from hardware.errors import Connection, DeviceError, StaleDataError, also
 
@@ -234,24 +234,23 @@ class BaseArm(Connection):
             raise DeviceError(f"{self.name}: speeds of {linear_mm_s} mm/s and {angular_deg_s} deg/s; both must be positive")
 
 
-class LinkageArm(BaseArm):
-    """Base class of the Dobots, whose targets are checked by their linkage's kinematics before they are sent."""
+class KinematicArm(BaseArm):
+    """Base class of arms whose kinematics are known from the start. Each target is checked by them before it is sent."""
 
-    axes = 4
-    kinematics: LinkageKinematics
+    kinematics: Kinematics
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         with self._watch_move():
             sent, joints = linear_target(self.name, self.kinematics, pose)
-            self._move(sent[[0, 1, 2, 5]], joints, sent, wait=wait, timeout_s=timeout_s)
+            self._move(joints, sent, wait=wait, timeout_s=timeout_s)
         return sent
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         with self._watch_move():
-            sent = joint_target(self.name, joints_deg)
-            self._move(sent, sent, None, wait=wait, timeout_s=timeout_s)
+            sent = joint_target(self.name, joints_deg, self.axes)
+            self._move(sent, None, wait=wait, timeout_s=timeout_s)
         return sent
 
     @abstractmethod
-    def _move(self, numbers: np.ndarray, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float) -> None:
-        """Send four numbers as the target of a linear move to ``pose`` (6,), or of a move of the joints (4,) if there is no pose."""
+    def _move(self, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float) -> None:
+        """Move along a line to ``pose`` (6,), where the joints (J,) are these, or, without a pose, move the joints there."""

@@ -6,7 +6,7 @@ and J3 are absolute angles of the two links, J2 from the vertical and J3 downwar
     rho = R0 + L1 sin J2 + L2 cos J3        z = Z0 + L1 cos J2 - L2 sin J3        R = J1 + J4 (not wrapped)
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -100,29 +100,10 @@ class LinkageKinematics:
         j1 = np.degrees(np.arctan2(y, x))
         return np.array([x, y, z, 0.0, 0.0, turn - 360.0 * np.round((turn - j1) / 360.0)])
 
-    def fit_lengths(self, joints_deg: np.ndarray, poses: np.ndarray) -> "LinkageKinematics":
-        """The same arm with the four lengths that fit measured pairs best (they enter linearly).
-
-        Parameters
-        ----------
-        joints_deg : (M, 4) float
-        poses : (M, 6) float
-        """
-        _, j2, j3, _ = np.radians(joints_deg).T
-        rho, z = np.hypot(poses[:, 0], poses[:, 1]), poses[:, 2]
-        one, none = np.ones_like(rho), np.zeros_like(rho)
-        rows = np.vstack([np.c_[np.sin(j2), np.cos(j3), one, none], np.c_[np.cos(j2), -np.sin(j3), none, one]])
-        (l1, l2, r0, z0), _, rank, _ = np.linalg.lstsq(rows, np.r_[rho, z], rcond=None)
-        if rank < 4:
-            raise ValueError(f"{len(rho)} pairs do not determine the lengths; give pairs of different J2 and J3")
-        return replace(self, l1_mm=float(l1), l2_mm=float(l2), r0_mm=float(r0), z0_mm=float(z0))
-
 
 _MG400_LIMITS_DEG = ((-160.0, 160.0), (-25.0, 85.0), (-25.0, 105.0), (-180.0, 180.0))
 # The manual does not give the linkage's limit. A real arm raised an alarm at exactly 60 deg.
-MG400_NOMINAL = LinkageKinematics(175.0, 175.0, 109.5, -53.8, _MG400_LIMITS_DEG, 60.0)
 MG400 = LinkageKinematics(174.207, 175.070, 109.500, -53.000, _MG400_LIMITS_DEG, 60.0)  # fitted to ten joint/pose pairs of a real arm
-MG400_REACH_MM = 440.0
 _MAGICIAN_LIMITS_DEG = ((-125.0, 125.0), (-5.0, 90.0), (-15.0, 70.0), (-150.0, 150.0))  # as public clients of the Magician use them
 MAGICIAN = LinkageKinematics(135.0, 147.0, 0.0, 0.0, _MAGICIAN_LIMITS_DEG)
 
@@ -170,8 +151,8 @@ def finite_numbers(what: str, given: np.ndarray, count: int) -> np.ndarray:
     return numbers
 
 
-def linear_target(name: str, kinematics: LinkageKinematics, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The pose (6,) nearest to the requested one that the arm can take, and its joints (4,).
+def linear_target(name: str, kinematics: Kinematics, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The pose (6,) nearest to the requested one that the arm can take, and its joints (J,).
 
     Raises
     ------
@@ -183,12 +164,12 @@ def linear_target(name: str, kinematics: LinkageKinematics, pose: np.ndarray) ->
         return sent, kinematics.inverse(sent)
 
 
-def joint_target(name: str, joints_deg: np.ndarray, axes: int = 4) -> np.ndarray:
+def joint_target(name: str, joints_deg: np.ndarray, axes: int) -> np.ndarray:
     """Joint angles (J,), or ``DeviceError`` if they are not a finite number for each of the arm's axes."""
     return finite_numbers(f"{name}: the joint angles", joints_deg, axes)
 
 
-def require_possible(name: str, kinematics: LinkageKinematics, joints_deg: np.ndarray) -> None:
-    """Raise ``DeviceError`` unless the joints (4,) are within the limits."""
+def require_possible(name: str, kinematics: Kinematics, joints_deg: np.ndarray) -> None:
+    """Raise ``DeviceError`` unless the joints (J,) are within the limits."""
     if violation := kinematics.violation(joints_deg):
         raise DeviceError(f"{name}: {violation.text}; nothing was sent. Choose a target within reach and limits")

@@ -10,10 +10,10 @@ import numpy as np
 import serial
 from serial.tools import list_ports
 
-from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, LinkageArm
+from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, KinematicArm
 from hardware.arms.awake import awake_s
 from hardware.arms.dobot_alarms import explain
-from hardware.arms.kinematics import MAGICIAN, require_possible
+from hardware.arms.kinematics import MAGICIAN, LinkageKinematics, require_possible
 from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
 from hardware.arms.supervisor import Supervisor, supervise_connection
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
@@ -41,7 +41,7 @@ INDEX_BYTES = 8
 ACCELERATION = 4.0
 
 
-class Magician(LinkageArm):
+class Magician(KinematicArm):
     """A Dobot Magician.
 
     The arm has no command that switches its motors. ``enable`` allows moves; ``disable`` stops the arm and refuses further moves.
@@ -55,6 +55,9 @@ class Magician(LinkageArm):
     supervised : bool
         Whether a further process stops the arm if this program dies while the arm is enabled.
     """
+
+    axes = 4
+    kinematics: LinkageKinematics
 
     def __init__(self, port: str, *, tool_x_mm: float = 0.0, supervised: bool = True) -> None:
         self._supervised = supervised
@@ -162,12 +165,13 @@ class Magician(LinkageArm):
         self._request(Id.PTP_COORDINATE_PARAMS, struct.pack("<4f", *line), ctrl=WRITE)
         self._request(Id.PTP_JOINT_PARAMS, struct.pack("<8f", *joints), ctrl=WRITE)
 
-    def _move(self, numbers: np.ndarray, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float) -> None:
+    def _move(self, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float) -> None:
         self._require_enabled()
         require_possible(self.name, self.kinematics, joints)
         if alarms := self._alarms():
             raise DeviceError(f"{self.name}: {explain(alarms)}")
-        begun_s, mode = time.monotonic(), Ptp.MOVJ_ANGLE if pose is None else Ptp.MOVL_XYZ
+        begun_s = time.monotonic()
+        mode, numbers = (Ptp.MOVJ_ANGLE, joints) if pose is None else (Ptp.MOVL_XYZ, pose[[0, 1, 2, 5]])
         self._last_index = self._index_of(self._request(Id.PTP, struct.pack("<B4f", mode, *numbers), ctrl=WRITE | QUEUED))
         if not wait:
             return

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hardware.arms import kinematics as arms
-from hardware.arms.arm import POLL_S, ArmState, LinkageArm
+from hardware.arms.arm import POLL_S, ArmState, KinematicArm
 from hardware.arms.dobot_alarms import explain
 from hardware.arms.kinematics import LinkageKinematics, require_possible
 from hardware.arms.mg400_link import REPLY_TIMEOUT_S, SILENCE_S, CommandPort, Feedback, NoReplyError
@@ -75,7 +75,7 @@ class Mg400Ports:
         return Mg400Ports(self.dashboard + offset, self.motion + offset, tuple(port + offset for port in self.feedback))
 
 
-class MG400(LinkageArm):
+class MG400(KinematicArm):
     """A Dobot MG400.
 
     Its pose is that of the tool in the user frame that are selected in the arm (0 and 0 after ``enable``).
@@ -92,6 +92,8 @@ class MG400(LinkageArm):
     supervised : bool
         Whether a further process stops and disables the arm if this program dies while the arm is enabled.
     """
+
+    axes = 4
 
     def __init__(
         self,
@@ -277,7 +279,7 @@ class MG400(LinkageArm):
         wanted_s = max(length_mm / self._speed[0], turn_deg / self._speed[1])
         return f",SpeedL={int(np.clip(np.floor(100 * turn_deg / MAX_JOINT_DEG_S / wanted_s + 1e-9), 1, 100))}"
 
-    def _move(self, numbers: np.ndarray, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float) -> None:
+    def _move(self, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float) -> None:
         self._require_connected()
         require_possible(self.name, self.kinematics, joints)
         packet, _ = self._feedback.newest(SILENCE_S)  # checked here, because old firmware does not report a refusal
@@ -286,8 +288,10 @@ class MG400(LinkageArm):
         if int(packet["mode"]) not in ENABLED_MODES:
             raise DeviceError(f"{self.name}: {DISABLED if self._enabled else 'not enabled; call enable() first'}")
         begun_s = time.monotonic()
-        command, options = ("JointMovJ", "") if pose is None else ("MovL", self._turning_option(pose))
-        self._send_motion(f"{command}({','.join(f'{number:.4f}' for number in numbers)}{options})")
+        if pose is None:
+            self._send_motion(f"JointMovJ({_text(joints)})")
+        else:
+            self._send_motion(f"MovL({_text(pose[[0, 1, 2, 5]])}{self._turning_option(pose)})")
         self._sent = pose
         if not wait:
             return
@@ -405,3 +409,7 @@ class MG400(LinkageArm):
         self._dashboard.close()
         self._motion.close()
         self._feedback.close()
+
+
+def _text(numbers: np.ndarray) -> str:
+    return ",".join(f"{number:.4f}" for number in numbers)

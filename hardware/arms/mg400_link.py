@@ -154,7 +154,7 @@ class CommandPort:
         came = self._buffer
         self.close()
         reason = f" ({error.strerror or error})" if error else ""
-        if came and not self._begins_reply(came):
+        if came and came.lstrip()[:1] not in "-0123456789":  # it can't be the beginning of a reply
             said, (host, port) = describe_bytes(came.encode("ascii", errors="replace")), self._address
             raise DeviceNotConnectedError(
                 f"{self._name}: {said} came from {host}:{port}: this is no MG400. Check address and port"
@@ -163,11 +163,6 @@ class CommandPort:
         raise DeviceNotConnectedError(
             f"{self._name}: the arm closed the connection{reason}. {why}, then disconnect() and connect() again"
         ) from error
-
-    @staticmethod
-    def _begins_reply(text: str) -> bool:
-        """Whether a text can be the beginning of a reply."""
-        return text.lstrip()[:1] in "-0123456789"
 
 
 class Feedback:

@@ -82,10 +82,6 @@ class Reply:
     def name(self) -> str:
         return self.echo.split("(")[0].strip().lower()
 
-    def numbers(self) -> list[float]:
-        """The reply's values as numbers."""
-        return [float(text) for text in re.findall(r"-?\d+(?:\.\d+)?(?:e-?\d+)?", self.values)]
-
     def alarms(self) -> list[int]:
         """The alarms in a reply to ``GetErrorID``, from 5 to 7 groups. Values that are not whole numbers are left out."""
         listed = [text.strip() for group in re.findall(r"\[([^\[\]]*)\]", self.values) for text in group.split(",")]

@@ -110,16 +110,6 @@ class SessionSource(SequentialSource):
         self.session = Session(folder)
         super().__init__(str(folder), self.session.form)
 
-    @property
-    def steps(self) -> list[dict]:
-        """The session's complete steps."""
-        return self.session.steps
-
-    @property
-    def rest(self) -> Frame | None:
-        """The no-contact frame from which the pins' displacements were computed."""
-        return self.session.rest
-
     def notes(self) -> list[str]:
         return self.session.notes
 

@@ -33,7 +33,7 @@ from twin.errors import ErrorsAs, FrameError, format_count
 from twin.frames.folders import pictures_folder
 from twin.frames.images import write_image
 from twin.pins import Pipeline, measure_reference
-from twin.progress import Progress, Step, silent, stage
+from twin.progress import Progress, Step, silent, stage, unheard
 from twin.records import KeptAlso
 from twin.rig.arm_pose import matrix_of, pose_of
 from twin.store import contents, made_by, output, write_json, write_text, writes
@@ -237,7 +237,7 @@ def collect(
     speed: tuple[float, float],
     frame_timeout_s: float | None = None,
     on_rest: Callable[[Frame], None] | None = None,
-    progress: Step | None = None,
+    progress: Step = unheard,
 ) -> int:
     """Collect contacts until the collection holds ``count``. Contacts that it already holds are not made again.
 
@@ -294,8 +294,7 @@ def collect(
                         on_rest(rest)
                 for index in range(collection.count, count):
                     _collect_one(stops, experiment, collection, index, draw_contact(experiment, seed, index, design))
-                    if progress is not None:
-                        progress(index + 1, count)
+                    progress(index + 1, count)
         finally:
             failed = stops.mover.release(touching=at_object)
     if failed:

@@ -143,11 +143,6 @@ class EmulatedController:
         with self.lock:
             return bool(self._queue) or self.track.moving(self.advance())
 
-    @property
-    def takes_moves(self) -> bool:
-        """Whether the queue runs, as ``enable`` of a driver makes it."""
-        return self._running
-
     def advance(self) -> float:
         """Execute the queue up to the present time, which is returned. A command that fails ends with an alarm and is not tried again."""
         now_s = time.monotonic()

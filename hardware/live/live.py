@@ -351,7 +351,7 @@ def watch(
     kept = KeptAlso(plan.record or Path(), plan.also, model.sensor)
     source = SessionSource(plan.replay) if plan.replay is not None else open_camera(plan.camera, model.sensor, model.form)
     model.check(model.sensor, source.form)
-    rest = source.rest if isinstance(source, SessionSource) else load_rest_frame(plan.at_rest, model)
+    rest = source.session.rest if isinstance(source, SessionSource) else load_rest_frame(plan.at_rest, model)
     found: list[np.ndarray] = []
 
     def keep(frame: Frame, estimate: Estimate) -> None:
@@ -385,7 +385,7 @@ def watch(
             session.run(most=plan.count, seconds=plan.seconds, rate_hz=plan.rate or np.inf, going=lambda: shower is None or shower.open)
         except KeyboardInterrupt:
             interrupted = True
-        same = (same_estimates(source.steps, found), len(found)) if isinstance(source, SessionSource) else None
+        same = (same_estimates(source.session.steps, found), len(found)) if isinstance(source, SessionSource) else None
         return WatchResult(session.timing(), interrupted, same, plan.record, session.count, source.notes(), session.valid, session.invalid)
 
 

@@ -8,12 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from arms import mg400_of
+from faulty_arm import ArmFault, FaultyArm
 from free_ports import free_offset
 from noisy_camera import NoisyCamera
 from pins_camera import AT_REST, StudioModel, shows
 from true_estimator import TrueEstimator
 
-from hardware.arms.simulated import SimulatedArm, SimulatedFault
+from hardware.arms.simulated import SimulatedArm
 from hardware.collect.collect import Collection, collect
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError, DeviceNotConnectedError
@@ -41,7 +42,7 @@ def placed():
 
 @pytest.fixture
 def arm(placed):
-    with SimulatedArm(pose=placed.start_pose(-60.0), time_scale=20.0) as arm:
+    with FaultyArm(pose=placed.start_pose(-60.0), time_scale=20.0) as arm:
         yield arm
 
 
@@ -120,7 +121,7 @@ def test_collecting_disables_though_its_retreat_is_interrupted(arm, placed, tmp_
 
 
 def test_an_arm_that_could_not_be_let_go_is_told_with_the_error(arm, placed, tmp_path):
-    arm.faults.add(SimulatedFault.IGNORE)
+    arm.faults.add(ArmFault.IGNORE)
 
     def dead():
         raise DeviceError("press its emergency stop")

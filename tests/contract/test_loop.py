@@ -5,10 +5,11 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
+from faulty_arm import ArmFault, FaultyArm
 from noisy_camera import NoisyCamera
 from true_estimator import TrueEstimate, TrueEstimator
 
-from hardware.arms.simulated import SimulatedArm, SimulatedFault
+from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.recorded import SessionSource
 from hardware.emulators.camera import CameraEmulator
@@ -32,7 +33,7 @@ def rig():
     sensor = load_sensor("mg400-331")
     mounting = Mounting.of(sensor, load_experiment("surface-2d"))
     placed = PlacedObject(load_object("can"), PlacementSpec(), mounting)
-    arm = SimulatedArm(axes=6, pose=placed.start_pose(-60.0), time_scale=SPEED)
+    arm = FaultyArm(axes=6, pose=placed.start_pose(-60.0), time_scale=SPEED)
     return placed, arm
 
 
@@ -265,7 +266,7 @@ def test_an_estimate_that_cannot_be_moves_nothing(rig, off):
     assert len(loop.records) == 5
 
 
-@pytest.mark.parametrize("fault", [SimulatedFault.COLLIDE, SimulatedFault.SILENT, SimulatedFault.STALL])
+@pytest.mark.parametrize("fault", [ArmFault.COLLIDE, ArmFault.SILENT, ArmFault.STALL])
 def test_an_arm_that_fails_ends_the_loop(rig, fault):
     _, arm = rig
     with arm, NoisyCamera() as source:

@@ -303,7 +303,7 @@ def _await_phase(emulator, placed, phase: str, gap_mm: float, later_s: float, do
         if isinstance(emulator, Ros2Emulator):
             ready = emulator.commands > 0
         else:
-            ready = emulator.arm.takes_moves if isinstance(emulator, MagicianEmulator) else emulator.arm.enabled
+            ready = emulator.arm._running if isinstance(emulator, MagicianEmulator) else emulator.arm.enabled
         if phase == "standing" and ready:
             return
         if phase in GAPS_MM and clear and gap <= gap_mm:

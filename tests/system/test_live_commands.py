@@ -114,7 +114,7 @@ def test_servo_writes_what_it_says_and_a_session_that_replays(stand_in, tmp_path
     kept = open_records(out / "session" / "mcap")
     assert [episode.length for episode in kept.episodes] == [STEPS]
     for row, step in zip(rows, kept.episodes[0].steps(), strict=True):
-        assert step.values["action"][0] == np.float32(session.steps[int(row["step"])]["sent"][0])
+        assert step.values["action"][0] == np.float32(session.session.steps[int(row["step"])]["sent"][0])
     # the frames show a contact: pins have moved, and the pipeline sees them
     seen = stand_in.pipeline(frames[-1])
     assert seen.valid
@@ -194,7 +194,7 @@ def test_a_follow_that_ends_early_is_written_and_is_an_exit_code(stand_in, tmp_p
 def test_pins_are_counted_from_a_frame_taken_clear_of_the_object_and_so_they_are_in_a_replay(tmp_path):
     out = tmp_path / "servo"
     run("servo", "--object", "can", "--out", out, "--steps", 4, "--plain-light", "--record")
-    rest = SessionSource(out / "session").rest
+    rest = SessionSource(out / "session").session.rest
     pipeline = Pipeline(load_sensor("mg400-331"), Form.PROCESSED)
     seen = pipeline(rest)
     assert seen.valid and np.linalg.norm(seen.graph.nodes_px - pipeline.reference.pins_px, axis=1).max() < 1.0  # px: nothing is touched

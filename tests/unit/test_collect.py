@@ -6,8 +6,9 @@ import time
 
 import numpy as np
 import pytest
+from faulty_arm import ArmFault, FaultyArm
 
-from hardware.arms.simulated import SimulatedArm, SimulatedFault
+from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.reader import DevicePicture, LiveSource
 from hardware.collect.collect import COLUMNS, META, Collection, WorkFrame, collect, draw_contact
 from hardware.errors import DeviceError
@@ -60,7 +61,7 @@ def seen_mm(image: np.ndarray) -> np.ndarray:
 def rig():
     sensor, experiment = load_sensor("mg400-331"), load_experiment("surface-2d")
     placed = PlacedObject(load_object("plane"), PlacementSpec(), Mounting.of(sensor, experiment))
-    arm = SimulatedArm(axes=6, time_scale=FAST)
+    arm = FaultyArm(axes=6, time_scale=FAST)
     return experiment, placed, arm
 
 
@@ -79,7 +80,7 @@ def rows(folder):
 
 def test_every_frame_shows_the_confirmed_pose_with_a_slow_arm_and_a_late_camera(rig, tmp_path):
     experiment, placed, arm = rig
-    arm.faults.add(SimulatedFault.SLOW)
+    arm.faults.add(ArmFault.SLOW)
     assert run(rig, tmp_path, 3, late_s=LATE_S) == 3
     frame_of = WorkFrame(experiment, placed)
     for row in rows(tmp_path):
@@ -146,7 +147,7 @@ def test_the_folder_is_a_recording(rig, tmp_path):
 
 
 def test_an_arm_that_did_not_move_is_not_believed(rig, tmp_path):
-    rig[2].faults.add(SimulatedFault.IGNORE)
+    rig[2].faults.add(ArmFault.IGNORE)
     with pytest.raises(DeviceError, match="not executed"):
         run(rig, tmp_path, 1)
     assert rows(tmp_path) == []

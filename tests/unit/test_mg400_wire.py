@@ -117,12 +117,6 @@ def test_replies_of_every_form(arrived, reply):
     assert (taken.error_id, taken.values, taken.name) == reply and rest == "0,{"
 
 
-@pytest.mark.parametrize("count", [4, 6])
-def test_a_pose_has_four_values_or_more(count):
-    reply, _ = take_reply(f"0,{{{','.join(['1.5'] * count)}}},GetPose();")
-    assert reply.numbers()[:4] == [1.5] * 4
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [

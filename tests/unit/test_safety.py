@@ -4,12 +4,13 @@ import time
 
 import numpy as np
 import pytest
+from faulty_arm import ArmFault, FaultyArm
 from hypothesis import given
 from hypothesis import strategies as st
 
 from hardware.arms.arm import ArmState
 from hardware.arms.kinematics import MG400
-from hardware.arms.simulated import SimulatedArm, SimulatedFault
+from hardware.arms.simulated import SimulatedArm
 from hardware.errors import DeviceError
 from hardware.safety.decide import SHIPPED_LIMITS, Action, DecisionCode, SafetyLimits, Sensed, clip, decide, decide_joints, load_limits
 from hardware.safety.safe_arm import RefusedMoveError, SafeArm
@@ -165,7 +166,7 @@ def test_a_file_is_read_as_limits_whatever_its_name_and_a_name_comes_before_a_fo
 
 @pytest.fixture
 def arm():
-    arm = SimulatedArm(axes=4, time_scale=20.0)
+    arm = FaultyArm(axes=4, time_scale=20.0)
     arm.connect()
     arm.enable()
     yield arm
@@ -213,7 +214,7 @@ def test_silent_feedback_stops_it(arm):
     safe = SafeArm(arm, FREE.model_copy(update={"feedback_age_s": 0.05}))
     safe.set_speed(1.0, 1.0)
     arm.move_linear(HOME + [0, 100, 0, 0, 0, 0], wait=False)
-    arm.faults.add(SimulatedFault.SILENT)
+    arm.faults.add(ArmFault.SILENT)
     assert arm.state().moving  # the last it tells
     time.sleep(0.06)
     with pytest.raises(RefusedMoveError, match="stale-feedback"):

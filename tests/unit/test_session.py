@@ -60,9 +60,9 @@ def test_killed_at_any_moment_it_is_whole_up_to_the_last_line(tmp_path, after_s)
     process.wait()
     process.stdout.close()
     source = SessionSource(tmp_path / "s")
-    assert len(source.steps) >= 4
+    assert len(source.session.steps) >= 4
     with source:
-        for step in source.steps:
+        for step in source.session.steps:
             assert int(source.read().image.astype(int).sum()) == step["sum"]
         with pytest.raises(EOFError):
             source.read()
@@ -127,7 +127,7 @@ def recorded(folder):
 
 def replayed(folder):
     with SessionSource(folder) as source:
-        return [source.read() for _ in source.steps], source.notes()
+        return [source.read() for _ in source.session.steps], source.notes()
 
 
 @pytest.mark.parametrize("name", ["../../secret.png", "/etc/passwd", "..", "a/b.png", "", "a\u0000b"])
@@ -149,7 +149,7 @@ def test_a_picture_outside_the_session_is_not_read_by_a_link(tmp_path, linked):
     (folder / linked).symlink_to(tmp_path / "elsewhere")
     with pytest.raises(FrameError, match="outside the session"):
         replayed(folder)
-        _ = SessionSource(folder).rest
+        _ = SessionSource(folder).session.rest
 
 
 def test_a_picture_that_is_a_link_to_itself_is_refused(tmp_path):

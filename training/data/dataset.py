@@ -14,7 +14,7 @@ from twin.errors import FrameError
 from twin.frames import natural_key, open_recording
 from twin.frames.tables import describe_count
 from twin.pins import nominal_reference
-from twin.progress import Step
+from twin.progress import Step, unheard
 from twin.rig.labels import label_slope, plate_slope
 from twin.types import Form
 
@@ -96,7 +96,7 @@ class Dataset:
 
 
 def load_dataset(
-    folder: str | Path, spec: SensorSpec, columns: str | tuple = "surface-2d", *, form: Form | None = None, progress: Step | None = None
+    folder: str | Path, spec: SensorSpec, columns: str | tuple = "surface-2d", *, form: Form | None = None, progress: Step = unheard
 ) -> Dataset:
     """Read a labelled recording, real or simulated.
 

@@ -19,7 +19,7 @@ from twin.frames.forms import gray_levels
 from twin.pins import Pipeline, make_graph, make_reference
 from twin.pins.batch import UNMEASURED, recording_reference
 from twin.pins.labelling.reference import Reference
-from twin.progress import Step
+from twin.progress import Step, unheard
 from twin.store import cached_arrays
 from twin.types import Form, Frame
 
@@ -91,7 +91,7 @@ class PinTable:
         return replace(self, reference=reference, nodes_px=nodes_px, area_px2=area_px2)
 
 
-def pin_table(recording: Recording, spec: SensorSpec, *, problems: list[str], progress: Step | None = None) -> PinTable:
+def pin_table(recording: Recording, spec: SensorSpec, *, problems: list[str], progress: Step = unheard) -> PinTable:
     """Run the pipeline over a recording, or take its result from the cache.
 
     Frames that can't be read are appended to ``problems``.
@@ -116,8 +116,7 @@ def pin_table(recording: Recording, spec: SensorSpec, *, problems: list[str], pr
             areas.append(np.full(n, np.nan) if graph is None else graph.area_px2)
             lost.append(np.isnan(seen.pins_px[:, 0]))
             light.append(np.zeros(n) if graph is None else cap_light(frame, graph.nodes_px, reference))
-            if progress:
-                progress(frame.sequence + 1, len(recording))
+            progress(frame.sequence + 1, len(recording))
         notes += [f"{bad['image_name']}: {bad['reason']}" for bad in recording.failed]
         arrays = {"nodes_px": np.reshape(nodes, (-1, n, 2)), "area_px2": np.reshape(areas, (-1, n)), "light": np.reshape(light, (-1, n))}
         arrays |= {"lost": np.reshape(lost, (-1, n)).astype(bool), "valid": np.array(valid, bool)}
@@ -157,15 +156,14 @@ def _state(file: Path) -> tuple[int, int, int]:
     return status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
-def voronoi_areas(nodes_px: np.ndarray, reference: Reference, *, progress: Step | None = None) -> np.ndarray:
+def voronoi_areas(nodes_px: np.ndarray, reference: Reference, *, progress: Step = unheard) -> np.ndarray:
     """Voronoi areas (S, N) in px^2 of pins (S, N, 2) with this layout without contact. They are computed once, then stored on disk."""
 
     def compute() -> dict[str, np.ndarray]:
         areas = np.empty(nodes_px.shape[:2])
         for k, pins_px in enumerate(nodes_px):
             areas[k] = make_graph("voronoi", pins_px, outmost=reference.outmost, net=reference.net).area_px2
-            if progress:
-                progress(k + 1, len(nodes_px))
+            progress(k + 1, len(nodes_px))
         return {"area_px2": areas}
 
     key = {"pins": nodes_px.tobytes(), "rest": reference.pins_px.tobytes()}

@@ -19,7 +19,7 @@ from torch import nn
 from torch.nn import functional
 
 from twin.errors import FrameError
-from twin.progress import Step
+from twin.progress import Step, unheard
 
 # Side of a patch, px.
 PATCH_PX = 64
@@ -98,7 +98,7 @@ def two_sample(
     *,
     classifier: PatchClassifier = SMALL,
     seed: int = 0,
-    progress: Step | None = None,
+    progress: Step = unheard,
 ) -> TwoSample:
     """Test two sets of equally many frames.
 
@@ -133,8 +133,7 @@ def two_sample(
         for k in held:
             patches, truth = _patches(sets, np.array([k]), corners, rng, turned=False)
             correct[k] = ((network(patches) > 0) == (truth > 0.5)).double().mean().item()
-        if progress:
-            progress(fold + 1, folds)
+        progress(fold + 1, folds)
     return _outcome(correct, rng)
 
 
@@ -144,13 +143,13 @@ def evaluate_classifiers(
     inside: np.ndarray,
     *,
     judges: Mapping[str, PatchClassifier] = JUDGES,
-    progress: Step | None = None,
+    progress: Step = unheard,
 ) -> dict[str, TwoSample]:
     """Results of several classifiers for real and rendered frames, by the classifiers' names. Parameters are those of `two_sample`."""
     return {name: two_sample(real, rendered, inside, classifier=judge, progress=progress) for name, judge in judges.items()}
 
 
-def evaluate_halves(images: list[np.ndarray], inside: np.ndarray, *, progress: Step | None = None) -> dict[str, TwoSample]:
+def evaluate_halves(images: list[np.ndarray], inside: np.ndarray, *, progress: Step = unheard) -> dict[str, TwoSample]:
     """Results of each classifier for halves of the real frames, by the classifiers' names. Parameters are those of `real_halves`."""
     return {name: real_halves(images, inside, classifier=judge, progress=progress) for name, judge in JUDGES.items()}
 
@@ -161,7 +160,7 @@ def accuracy_text(accuracy: float, low: float, high: float) -> str:
 
 
 def real_halves(
-    images: list[np.ndarray], inside: np.ndarray, *, classifier: PatchClassifier = SMALL, seed: int = 0, progress: Step | None = None
+    images: list[np.ndarray], inside: np.ndarray, *, classifier: PatchClassifier = SMALL, seed: int = 0, progress: Step = unheard
 ) -> TwoSample:
     """Test two halves of one set of frames, for ``DIVISIONS`` random divisions: all pairs of frames together.
 
@@ -181,7 +180,7 @@ def real_halves(
     for division in range(DIVISIONS):
         order = rng.permutation(len(images))
         first, second = ([images[k] for k in part] for part in (order[:half], order[half : 2 * half]))
-        step = progress and partial(_part, progress, division, DIVISIONS)
+        step = partial(_part, progress, division, DIVISIONS)
         correct.append(two_sample(first, second, inside, classifier=classifier, seed=seed + division, progress=step).by_pair)
     return _outcome(np.concatenate(correct), rng)
 

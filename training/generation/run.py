@@ -10,7 +10,7 @@ from training.generation.make import REST, make_contact
 from training.generation.store import CONFIG, FILES, Store, refuse_foreign
 from twin.errors import OptionError, format_count
 from twin.frames.forms import frame_size
-from twin.progress import Progress, Step, silent, stage
+from twin.progress import Progress, Step, silent, stage, unheard
 from twin.records import KeptAlso
 from twin.rig.contact import friction_between
 from twin.store import output
@@ -54,7 +54,7 @@ class Simulated(ReadableResult):
 
 
 def generate(
-    folder: Path, config: GenerationConfig, count: int, *, workers: int = 1, scheduler: str = "", progress: Step | None = None
+    folder: Path, config: GenerationConfig, count: int, *, workers: int = 1, scheduler: str = "", progress: Step = unheard
 ) -> Simulated:
     """Make a data set of ``count`` contacts, or continue the one in the folder.
 
@@ -90,14 +90,12 @@ def generate(
         store.check_count(count)
         todo = [index for index in range(REST, count) if index not in done]
         made, failed = before, 0
-        if progress:
-            progress(made, count)
+        progress(made, count)
         for outcome in outcomes(make_contact, config.text(), todo, workers=workers, scheduler=scheduler):
             store.add(outcome)
             failed += len(outcome.failures)
             made += outcome.index != REST
-            if progress:
-                progress(made, count)
+            progress(made, count)
         return Simulated(folder, count, store.finish(count), before, failed)
 
 

@@ -208,10 +208,6 @@ class Trained:
     ensemble: Callable[[Inputs, torch.Tensor], Prediction]
     touched: Callable[[np.ndarray, np.ndarray], float] | None = None
 
-    def contact_probability(self, nodes_px: np.ndarray, lost: np.ndarray) -> float:
-        """Probability that pins (N, 2), of which some are ``lost`` (N,), show a contact; NaN if it is unknown."""
-        return float("nan") if self.touched is None else self.touched(nodes_px, lost)
-
 
 @dataclass(frozen=True)
 class Variant:
@@ -253,6 +249,8 @@ class Model(ABC):
         Whether it has ``modes``, so that a Gaussian process can be averaged with its networks.
     modes_scaled : bool
         Whether the scales of its modes show their importance, so that the process needs only one common length.
+    derived : tuple of str, optional
+        Weights that a small copy leaves out, because ``build`` makes them again. None: the model has no small copy.
     """
 
     name: str
@@ -265,6 +263,7 @@ class Model(ABC):
     counts_from_rest: ClassVar[bool] = False
     has_modes: ClassVar[bool] = False
     modes_scaled: ClassVar[bool] = False
+    derived: ClassVar[tuple[str, ...] | None] = None
 
     @abstractmethod
     def prepare(self, data: Dataset, train: np.ndarray) -> Prepared:
@@ -345,17 +344,13 @@ class Model(ABC):
         TrainingError
             The model has no small copy.
         """
-        raise TrainingError(f"{self.name} has no small copy: the effect of half precision on it was never measured")
+        if self.derived is None:
+            raise TrainingError(f"{self.name} has no small copy: the effect of half precision on it was never measured")
+        return {key: value for key, value in weights.items() if key not in self.derived}
 
     def unpack(self, packed: Weights, blank: Weights) -> Weights:
-        """The weights of a network from its small copy ``packed``; ``blank`` are the weights of the network that ``build`` makes.
-
-        Raises
-        ------
-        TrainingError
-            The model has no small copy.
-        """
-        raise TrainingError(f"{self.name} has no small copy")
+        """The weights of a network from its small copy ``packed``; ``blank`` are the weights of the network that ``build`` makes."""
+        return packed | {key: blank[key] for key in self.derived or ()}
 
 
 class PinModel(Model):
@@ -411,7 +406,7 @@ class PinModel(Model):
         if not seen.valid or seen.graph is None:
             return Unseen(seen.reason, seen=seen)
         lost = np.isnan(seen.pins_px[:, 0])
-        touched = trained.contact_probability(seen.graph.nodes_px, lost)
+        touched = float("nan") if trained.touched is None else trained.touched(seen.graph.nodes_px, lost)
         if touched < LIKELY:
             return Unseen(f"no contact (its probability is {touched:.0%})", touched, seen)
         reference = trained.pipeline.reference

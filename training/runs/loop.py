@@ -4,7 +4,7 @@ Functions for all networks follow: their size, their device, their outputs for m
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
 
@@ -14,7 +14,6 @@ from torch import nn
 from training.errors import TrainingError
 from training.models.part import Inputs, Recipe
 from twin.errors import OptionError
-from twin.progress import Step
 
 # Steps at the start in which the cosine schedule's learning rate rises from 0 to its full value.
 RISE_STEPS = 100
@@ -53,10 +52,6 @@ class TrainingRows:
     held: torch.Tensor
 
 
-def no_penalty(network: nn.Module) -> None:
-    """The penalty of networks without one: it adds nothing to the loss."""
-
-
 @dataclass
 class Loop:
     """A network in training. ``epoch()`` runs one epoch; ``state()`` and ``load()`` store and restore the whole state of the training.
@@ -68,7 +63,7 @@ class Loop:
     rows : Rows
     seed : int
         Seed of the order of the rows.
-    penalty : callable, optional
+    penalty : callable
         ``penalty(network)`` is added to the loss of every batch.
     """
 
@@ -76,7 +71,7 @@ class Loop:
     recipe: Recipe
     rows: TrainingRows
     seed: int
-    penalty: Callable[[nn.Module], torch.Tensor | None] = no_penalty
+    penalty: Callable[[nn.Module], torch.Tensor | None]
     epochs_done: int = 0
     best: float = math.inf
     since_best: int = 0
@@ -198,15 +193,6 @@ def row_loss(out: dict, labels: torch.Tensor, executed: torch.Tensor, weight: to
         cross = nn.functional.binary_cross_entropy_with_logits(out["executed"][known], executed[known])
         loss = loss + EXECUTED_LOSS * cross
     return loss
-
-
-def epoch_step(step: Step) -> Callable[[int, int, Mapping[str, float]], None]:
-    """The callback of ``train_run`` that reports epochs as a ``twin.progress`` step, with the error on held-out rows as the note."""
-
-    def report_epoch(done: int, total: int, point: Mapping[str, float]) -> None:
-        step(done, total, f"{point['held_out_error']:.4f}")
-
-    return report_epoch
 
 
 def parameter_count(network: nn.Module) -> int:

@@ -9,7 +9,6 @@ Frames to which the light was fitted are left out: their renders are more like t
 rendered with a network that was taught on the other half of the frames. The network that is written was taught on all of them.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,7 +31,7 @@ from twin.frames.recording import BadFrame
 from twin.mechanics.skin_fit import SkinFit
 from twin.optics.render import Renderer
 from twin.pins.pipeline import Pipeline
-from twin.progress import Progress, silent, stage
+from twin.progress import Progress, Step, silent, stage, unheard
 from twin.store import writes_file
 from twin.types import FloatArray, Form, Frame, ImageArray
 
@@ -215,7 +214,7 @@ def teach(
     *,
     steps: int = STEPS,
     seed: int = 0,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Step = unheard,
 ) -> ResidualSpec:
     """A residual network that was taught on real frames (H, W, 3) uint8 and the rendered light (H, W, 3) of the same states.
 
@@ -263,8 +262,7 @@ def teach(
                 mine.step()
                 for mean, weights in zip(kept, network.parameters(), strict=True):
                     mean.lerp_(weights.detach(), KEPT_SHARE if done > ALONE else 1.0)
-            if progress:
-                progress(done + 1, steps)
+            progress(done + 1, steps)
     return spec_of(kept, disc)
 
 

@@ -10,7 +10,7 @@ Every file is written as a whole or not at all.
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import monotonic
@@ -30,6 +30,7 @@ from training.runs.loop import Loop, TrainingRows, parameter_count
 from training.runs.run_files import CHECKPOINT, CONFIG, TENSORS, damage_error, read_config, read_tensors, write_tensors
 from twin.errors import ErrorsAs
 from twin.frames.forms import blob_spec
+from twin.progress import Step, unheard
 from twin.report.table import write_rows
 from twin.store import fingerprint, write_text, writes
 
@@ -92,14 +93,14 @@ class _Lesson:
 
 @writes(*RUN_FILES, gone_on=(CHECKPOINT,))
 def train_run(
-    config: RunConfig, data: Dataset, out: Path, *, max_minutes: float | None = None, device: str = "cpu", progress: Callable | None = None
+    config: RunConfig, data: Dataset, out: Path, *, max_minutes: float | None = None, device: str = "cpu", progress: Step = unheard
 ) -> bool:
     """Train a run, or continue the one in ``out``. The order of the data set's rows does not matter.
 
     Parameters
     ----------
     progress : callable, optional
-        Called with (epochs done, epochs of all networks, last row of the learning curve).
+        Called with (epochs done, epochs of all networks, error on the held-out rows).
     max_minutes : float, optional
         Stop after the epoch in which this time has passed. The weights so far are written.
     device : {"cpu", "cuda"}
@@ -144,8 +145,7 @@ def train_run(
         state, kept, out_of_time = None, monotonic(), False
         while not loop.finished:
             point = loop.epoch()
-            if progress:
-                progress(member * config.recipe.epochs + point["epoch"], all_epochs, point)
+            progress(member * config.recipe.epochs + point["epoch"], all_epochs, f"{point['held_out_error']:.4f}")
             out_of_time = max_minutes is not None and monotonic() - started > 60 * max_minutes
             if out_of_time or monotonic() - kept > KEEP_EVERY_S:
                 lesson.keep(done, loop)

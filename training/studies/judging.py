@@ -24,7 +24,7 @@ from training.models.part import Prediction
 from training.runs.identity import rows_named
 from twin.estimate import readable_labels
 from twin.frames import open_recording
-from twin.progress import Step
+from twin.progress import Step, unheard
 from twin.report.charts import new_figure, save_figure
 from twin.report.table import write_table
 from twin.rig.labels import EXECUTED_FILES
@@ -251,7 +251,7 @@ CHANGES: dict[str, Change] = {
 
 
 def measure_changes(
-    estimator: PoseEstimator, data: Dataset, rows: np.ndarray, *, seed: int = 0, progress: Step | None = None
+    estimator: PoseEstimator, data: Dataset, rows: np.ndarray, *, seed: int = 0, progress: Step = unheard
 ) -> list[dict[str, Any]]:
     """Errors against corrected labels of single frames, unchanged and under every change.
 
@@ -278,8 +278,7 @@ def measure_changes(
         for name, change in changes.items():
             image = change(frame.image, rngs[name], estimator)
             value[name][m] = estimator(Frame(image, frame.form, name=frame.name)).value
-        if progress:
-            progress(m + 1, len(rows))
+        progress(m + 1, len(rows))
     truth = data.targets.corrected[rows]
     found = []
     for name, said in value.items():

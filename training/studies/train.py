@@ -18,7 +18,7 @@ from training.models import model_named, recipe_of
 from training.models.part import LIKELY
 from training.models.touch.model import TOUCH
 from training.runs.config import RunConfig, training_labels, training_rows
-from training.runs.loop import choose_device, epoch_step
+from training.runs.loop import choose_device
 from training.runs.run import RUN_FILES, train_run
 from training.runs.run_files import BESIDE_FILES, CHECKPOINT, DISPLACEMENTS, DOMAIN, MAPS, SLIP
 from training.touch.contact_maps import FEWEST_STATES, learn_maps, write_maps
@@ -142,7 +142,7 @@ def train_model(
     found = join_datasets(with_common_labels(parts) if target == CONTACT else parts)
     config = RunConfig(model, recipe, labels, seed, split, (SHEAR, TURN) if target == SHEAR_PRESET else ())
     with stage(progress, model) as step:
-        finished = train_run(config, found, out, max_minutes=max_minutes, device=chosen, progress=epoch_step(step))
+        finished = train_run(config, found, out, max_minutes=max_minutes, device=chosen, progress=step)
     if finished and config.model == TOUCH.name and all(is_simulated(folder) for folder in found.folders):
         with stage(progress, "contact maps"):
             found.problems.extend(add_maps(out, config, found))

@@ -16,7 +16,7 @@ from training.surrogate.bending import Bending, ample
 from training.surrogate.compliance import NODE_RINGS, Compliance, compliance_of, interpolation_matrix
 from training.surrogate.contact import LinearContacts
 from training.surrogate.contacts import SurrogateContacts
-from training.surrogate.model import SHIPPED, SUFFIX, VIEWS, Surrogate, features, gate, load_surrogate, mechanics_of, within
+from training.surrogate.model import SHIPPED, SUFFIX, Surrogate, features, gate, load_surrogate, mechanics_of, within
 from training.surrogate.paths import DEEPEST_MM, STICKING
 from training.surrogate.reading import EpisodeContact
 from training.surrogate.samples import PIN_RINGS, SolvedPath, lattice_sensor, solve_paths
@@ -44,18 +44,8 @@ JUDGED = 5
 """Every path whose number is a multiple of this is kept out of the training and used to measure the errors."""
 TURNS = 2
 """Number of turns about the sensor's axis at which each solved path is used: its contacts then lie elsewhere between the nodes."""
-MODE_STATES = 3000
-"""Approximate number of states from which the modes are computed."""
 AXIS_MM = 0.9
 """Length that converts changes of a pin's axis to motion, for the modes: about the length of a pin of the shipped sensors."""
-MODES = 64
-"""Number of modes of the pins' motion. The motion outside them is 0.01 mm on average."""
-WIDTH = 256
-"""Number of neurons of each of the network's two hidden layers."""
-BENT_MODES = 64
-"""Number of modes of the skin's bending (see ``bending``)."""
-BENT_WIDTH = 160
-"""Number of neurons of each hidden layer of the bending network."""
 LIGHT = 0.01
 """Mean square of the bending network's inputs below which all states have the same weight in the regression of its linear part."""
 STEADY = 1e-3
@@ -64,20 +54,16 @@ LOST = 0.02
 """Largest share of a state's force that may lie beyond the nodes, for the state to be used for the skin's bending."""
 EPOCHS = 36
 BATCH = 512
-RATE = 3e-3
-"""Largest learning rate of Adam in its cycle. For a network that continues from a start it is a third of this."""
+RATE = 1e-3
+"""Largest learning rate of Adam in its cycle."""
 DECAY = 0.005
 """Weight decay."""
 DEEPEST_TAKEN_MM = DEEPEST_MM + 0.5
 """Largest indentation of the surrogate's domain."""
 POLAR_DEG = 48.0
 """Largest angle of a contact's deepest place from the apex. Paths begin within 35 deg and move on from there."""
-OTHERS_SCALE = (*(0.15,) * 3, *(1.5,) * 3, 1.0, 0.5)
-"""Errors of force (N), torque (N mm), area (100 mm2) and sliding share that weigh as much as a usual error of the modes."""
 LEAST_MOVED_MM = 1.0
 """Softening of the states' weights in the loss, 1 / (LEAST_MOVED_MM^2 + m^2), where m is a state's largest motion of a pin or node."""
-SMALL_SCALE = 0.02
-"""Smallest scale of an input of the network, as a share of the largest scale."""
 TOUCHES_MM = 0.05
 """Smallest depth of a contact that is used."""
 LARGE_PX = 2.0
@@ -130,17 +116,14 @@ class _Samples:
 
 @dataclass(frozen=True)
 class _Truths:
-    """S states of the finite elements: displacements of and forces on the nodes (S, M, 3), and motion of the pins (S, 6 P); float32."""
+    """S states of the finite elements: displacements of and forces on the nodes (S, M, 3), float32."""
 
     moved: FloatArray
     force: FloatArray
-    pins: FloatArray
 
     def turn(self, g: Symmetry) -> "_Truths":
         """The same states, turned or mirrored."""
-        pins = self.pins.reshape(len(self.pins), 2, -1, 3)
-        pins = np.stack([g.move_vectors(pins[:, part], PIN_RINGS) for part in range(2)], axis=1)
-        return _Truths(g.move_vectors(self.moved, NODE_RINGS), g.move_vectors(self.force, NODE_RINGS), pins.reshape(len(pins), -1))
+        return _Truths(g.move_vectors(self.moved, NODE_RINGS), g.move_vectors(self.force, NODE_RINGS))
 
 
 @writes_file("out")
@@ -169,7 +152,7 @@ def distil(
     with stage(progress, f"contacts of {sensor.name}") as step:
         solved = solve_paths(sensor, range(seed * 100_000, seed * 100_000 + paths), processes=processes, progress=step)
     with stage(progress, "network") as step:
-        surrogate = fit(sensor, solved, start=load_surrogate(SHIPPED / f"{FAMILY}{SUFFIX}"), progress=step)
+        surrogate = fit(sensor, solved, load_surrogate(SHIPPED / f"{FAMILY}{SUFFIX}"), progress=step)
     return Distilled(surrogate, surrogate.save(out), [out])
 
 
@@ -188,13 +171,12 @@ def require_dome(sensor: SensorSpec) -> None:
         raise OptionError(f"{sensor.name}: its gel is sealed, which a surrogate does not model; use backend='fem'")
 
 
-def fit(sensor: SensorSpec, solved: Sequence[SolvedPath], *, start: Surrogate | None = None, progress: Any = lambda *_: None) -> Surrogate:
+def fit(sensor: SensorSpec, solved: Sequence[SolvedPath], start: Surrogate, *, progress: Any) -> Surrogate:
     """Fit a surrogate to solved paths of the sensor's lattice.
 
-    Every fifth path of ``solved`` is used only to measure the errors. ``start`` is a surrogate of a sensor whose pins are the lattice. If
-    it is given, its modes are used and the training continues from its networks: the corrections of sensors of one family are similar.
+    Every fifth path of ``solved`` is used only to measure the errors. ``start`` is a surrogate of a sensor whose pins are the lattice. Its
+    modes and scales are used, and the training continues from its networks: the corrections of sensors of one family are similar.
     """
-    torch.manual_seed(0)
     torch.set_num_threads(1)
     solved = [cut(path, sensor.skin.outer_radius_mm) for path in solved]
     seen = [path for number, path in enumerate(solved) if number % JUDGED]
@@ -205,20 +187,14 @@ def fit(sensor: SensorSpec, solved: Sequence[SolvedPath], *, start: Surrogate | 
     linear_pins = np.stack([skin.base, skin.axis]).astype(np.float32) * weights[..., None, None]  # (2, P, 3, M, 3)
     flat = linear_pins.reshape(linear_pins.shape[0] * linear_pins.shape[1] * 3, -1)
     group = symmetries(sensor.pins.phase_deg)
-    truths = _truths(sensor, seen, weights)
+    truths = _truths(seen)
     moves = truths.force.reshape(len(truths.force), -1) @ answer.transpose(0, 3, 1, 2).reshape(3 * len(answer), -1)
     softness = float((moves * truths.moved.reshape(moves.shape)).sum() / (moves**2).sum())
     answer, flat = softness * answer, softness * flat
     turned = [truths.turn(g) for g in group]
-    if start is None:
-        every = max(len(truths.force) * len(group) // MODE_STATES, 1)
-        pins = np.concatenate([part.pins[first::every] for first, part in enumerate(turned)])
-        forces = np.concatenate([part.force[first::every] for first, part in enumerate(turned)]).reshape(len(pins), -1)
-        modes = _main(np.concatenate([pins, 3 * (pins - forces @ flat.T)]), MODES)
-    else:
-        modes = _carry_modes(start, sensor, weights)
+    modes = _carry_modes(start, sensor, weights)
     read = modes @ flat
-    bending = _bending(turned, answer, read, start, progress)
+    bending = _bending(turned, answer, read, start.bending, progress)
     kernel = bending.kernel(read)
     rng = np.random.default_rng(0)
     turns = rng.uniform(0.0, np.pi / 3, (len(seen), TURNS))
@@ -227,35 +203,27 @@ def fit(sensor: SensorSpec, solved: Sequence[SolvedPath], *, start: Surrogate | 
         [sample_states(sensor, skin, answer, path, turn, kernel) for path, angles in zip(seen, turns, strict=True) for turn in angles]
     )
     rows = replace(rows, pins=rows.pins * weights)
-    view = start.view if start else _main(np.concatenate([_turn_states(rows, g).within[:: 4 * len(group)] for g in group]), VIEWS)
     inputs, outputs = [], []
     for g in group:
         part = _turn_states(rows, g)
-        seen_by = [part.force.reshape(len(part.force), -1) @ read.T, part.beside, part.within @ view.T]
+        seen_by = [part.force.reshape(len(part.force), -1) @ read.T, part.beside, part.within @ start.view.T]
         inputs.append(np.concatenate(seen_by, axis=1).astype(np.float32))
         lacks = (part.pins.reshape(len(part.pins), -1) - part.force.reshape(len(part.force), -1) @ flat.T) @ modes.T
         others = np.column_stack([part.area / 100.0, part.slip])
         outputs.append(np.concatenate([lacks, part.wrench - part.linear, others], axis=1).astype(np.float32))
     x, y = np.concatenate(inputs), np.concatenate(outputs)
-    if start is None:
-        mean, scale = x.mean(axis=0), x.std(axis=0)
-        for columns in (slice(0, MODES), slice(-VIEWS, None)):
-            scale[columns] = np.maximum(scale[columns], SMALL_SCALE * scale[columns].max())
-        out_scale = np.concatenate([np.full(MODES, y[:, :MODES].std(axis=0).max()), OTHERS_SCALE]).astype(np.float32)
-    else:
-        mean, scale, out_scale = start.mean, start.scale, start.out_scale
     largest = np.linalg.norm(rows.pins[:, 0], axis=2).max(axis=1)
     counts = np.tile(1.0 / (LEAST_MOVED_MM**2 + largest**2), len(group))
     gates = np.tile(gate(rows.depth), len(group))
-    given = (x - mean) / scale, y / out_scale, gates.astype(np.float32), (counts / counts.mean()).astype(np.float32)
-    layers = _train_network(*given, start.layers if start else (), WIDTH, progress)
+    given = (x - start.mean) / start.scale, y / start.out_scale, gates.astype(np.float32), (counts / counts.mean()).astype(np.float32)
+    layers = _train_network(*given, start.layers, progress)
     onto = _interpolation(sensor)
-    on_pins = np.einsum("np,kcpi->knci", onto, modes.reshape(MODES, 2, -1, 3) / weights[None], optimize=True)
+    on_pins = np.einsum("np,kcpi->knci", onto, modes.reshape(len(modes), 2, -1, 3) / weights[None], optimize=True)
     domain = {"depth_mm": DEEPEST_TAKEN_MM, "polar_deg": POLAR_DEG, "friction": STICKING}
     about = {"sensor": sensor.name, "mechanics": mechanics_of(sensor), "domain": domain, "paths": len(solved)}
     about |= {"states": int(sum(len(path.T) for path in solved))}
     answer, on_pins, read = (values.astype(np.float32) for values in (answer, on_pins, read))
-    made = Surrogate(about, skin.node_mm, answer, on_pins, read, view, bending, mean, scale, layers, out_scale)
+    made = replace(start, about=about, node_mm=skin.node_mm, answer=answer, modes=on_pins, read=read, bending=bending, layers=layers)
     made = made.as_kept()  # so that the errors are those of the file, which rounds the arrays
     about["errors"] = measure_errors(made, sensor, kept)
     return made
@@ -324,12 +292,6 @@ def sample_states(
     return _Samples(forces, beside, deep, near, wrench, pins.astype(np.float32), truth, path.area_mm2, path.slip - slips)
 
 
-def _main(rows: FloatArray, count: int) -> FloatArray:
-    """The first principal directions (count, n) of rows (S, n), without subtraction of their mean."""
-    rows = rows.astype(np.float64)
-    return np.linalg.eigh(rows.T @ rows)[1][:, ::-1][:, :count].T.astype(np.float32)
-
-
 def _carry_modes(start: Surrogate, sensor: SensorSpec, weights: FloatArray) -> FloatArray:
     """The modes (MODES, 6 P) of ``start``, a surrogate of another sensor of the family, on this sensor's lattice."""
     turn = about_z(np.radians(sensor.pins.phase_deg - start.phase_deg)).astype(np.float32)
@@ -337,39 +299,30 @@ def _carry_modes(start: Surrogate, sensor: SensorSpec, weights: FloatArray) -> F
     return np.ascontiguousarray(modes.reshape(len(modes), -1))
 
 
-def _truths(sensor: SensorSpec, solved: Sequence[SolvedPath], weights: FloatArray) -> _Truths:
+def _truths(solved: Sequence[SolvedPath]) -> _Truths:
     """The pressed states of solved paths whose force lies within the nodes, up to the share ``LOST``."""
-    rest = rest_pins(lattice_sensor(sensor).geometry)
-    at_rest = np.stack([rest.base_mm, rest.axis])
-    moved, force, pins = [], [], []
+    moved, force = [], []
     for path in solved:
         lost = np.linalg.norm(path.node_n.sum(axis=1) + path.force_n, axis=1)
         whole = lost < LOST * np.linalg.norm(path.force_n, axis=1)
         moved.append(path.node_mm[whole])
         force.append(path.node_n[whole])
-        if whole.any():
-            states = np.stack([path.base_mm[whole], path.axis[whole]], axis=1)
-            pins.append(((states - at_rest) * weights).reshape(len(states), -1))
-    return _Truths(*(np.concatenate(part).astype(np.float32) for part in (moved, force, pins)))
+    return _Truths(np.concatenate(moved).astype(np.float32), np.concatenate(force).astype(np.float32))
 
 
-def _bending(turned: Sequence[_Truths], answer: FloatArray, read: FloatArray, start: Surrogate | None, progress: Any) -> Bending:
+def _bending(turned: Sequence[_Truths], answer: FloatArray, read: FloatArray, start: Bending, progress: Any) -> Bending:
     """Fit the bending: the true displacements minus those of the linear skin under the same forces. ``turn`` has all symmetries."""
     compliance = answer.transpose(0, 3, 1, 2).reshape(3 * len(answer), -1).astype(np.float32)
     forces = [part.force.reshape(len(part.force), -1) for part in turned]
     lacks = [part.moved.reshape(len(part.moved), -1) - force @ compliance for part, force in zip(turned, forces, strict=True)]
-    modes = start.bending.modes.reshape(-1, len(compliance)) if start else _main(np.concatenate([part[::4] for part in lacks]), BENT_MODES)
+    modes = start.modes.reshape(-1, len(compliance))
     x, y = np.concatenate([force @ read.T for force in forces]), np.concatenate([part @ modes.T for part in lacks])
-    scale = start.bending.scale if start else np.maximum(x.std(axis=0), SMALL_SCALE * x.std(axis=0).max()).astype(np.float32)
-    x = x / scale
+    x = x / start.scale
     counts = np.tile(1.0 / (LEAST_MOVED_MM**2 + (turned[0].moved ** 2).sum(axis=2).max(axis=1)), len(turned))
     light = (1.0 / (LIGHT + (x**2).mean(axis=1)))[:, None]  # the linear part is for light contacts, so they weigh most
     straight = np.linalg.solve((x * light).T @ x + STEADY * len(x) * np.eye(x.shape[1]), (x * light).T @ y).T
-    rest, size = y - x @ straight.T, 1.0 if start else float(y.std(axis=0).max())
-    given = x, rest / size, ample(x), (counts / counts.mean()).astype(np.float32)
-    layers = _train_network(*given, start.bending.layers if start else (), BENT_WIDTH, progress)
-    layers = (*layers[:-1], (size * layers[-1][0], size * layers[-1][1]))
-    return Bending(scale, straight.astype(np.float32), layers, modes.reshape(len(modes), -1, 3))
+    layers = _train_network(x, y - x @ straight.T, ample(x), (counts / counts.mean()).astype(np.float32), start.layers, progress)
+    return Bending(start.scale, straight.astype(np.float32), layers, start.modes)
 
 
 def measure_errors(surrogate: Surrogate, sensor: SensorSpec, solved: Sequence[SolvedPath]) -> dict[str, Any]:
@@ -441,22 +394,21 @@ def _turned_wrench(values: FloatArray, g: Symmetry) -> FloatArray:
     return out
 
 
-def _train_network(x: FloatArray, y: FloatArray, gates: FloatArray, counts: FloatArray, start: Layers, width: int, progress: Any) -> Layers:
+def _train_network(x: FloatArray, y: FloatArray, gates: FloatArray, counts: FloatArray, start: Layers, progress: Any) -> Layers:
     """Train a network whose output, times the gates (S,), estimates y (S, o) from x (S, i); return its weights and offsets.
 
-    ``counts`` (S,) are the states' weights in the loss. Training starts from the weights and offsets of ``start``, if there are any.
+    ``counts`` (S,) are the states' weights in the loss. Training starts from the weights and offsets of ``start``.
     """
-    linear = [torch.nn.Linear(*sizes) for sizes in pairwise((x.shape[1], width, width, y.shape[1]))]
+    linear = [torch.nn.Linear(weight.shape[1], len(weight)) for weight, _ in start]
     net = torch.nn.Sequential(linear[0], torch.nn.SiLU(), linear[1], torch.nn.SiLU(), linear[2])
     inputs, wanted, share, count = (torch.from_numpy(np.ascontiguousarray(values)) for values in (x, y, gates[:, None], counts))
     batches = max(len(x) // BATCH, 1)
     with torch.no_grad():
-        for layer, (weight, offset) in zip(linear, start, strict=False):
+        for layer, (weight, offset) in zip(linear, start, strict=True):
             layer.weight.copy_(torch.from_numpy(weight))
             layer.bias.copy_(torch.from_numpy(offset))
-    rate = RATE / 3 if start else RATE
-    optimiser = torch.optim.AdamW(net.parameters(), lr=rate, weight_decay=DECAY)
-    cycle = torch.optim.lr_scheduler.OneCycleLR(optimiser, rate, total_steps=EPOCHS * batches)
+    optimiser = torch.optim.AdamW(net.parameters(), lr=RATE, weight_decay=DECAY)
+    cycle = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=EPOCHS * batches)
     generator = torch.Generator().manual_seed(0)
     for epoch in range(EPOCHS):
         order = torch.randperm(len(x), generator=generator)

@@ -19,7 +19,7 @@ from torch import nn
 from training.data.label_code import LabelCode
 from training.data.pins import PinTable
 from training.errors import TrainingError
-from training.models.part import ArrayInputs, Inputs, Learnt, Modes, PinModel, Recipe, Weights, refuse_sizes
+from training.models.part import ArrayInputs, Inputs, Learnt, Modes, PinModel, Recipe, refuse_sizes
 from training.models.steered.field import Waves, waves_of
 from twin.pins.labelling.reference import Reference
 
@@ -33,8 +33,6 @@ GUESS_ERROR_RAD = 0.07
 COPIES = 3
 # Number of inputs that describe a turn: sine and cosine of the turn and of twice the turn.
 KNOWN_OF_TURN = 4
-# Buffers that a small copy leaves out, because they follow from the pins at rest.
-DERIVED = ("fit", "order")
 # Components of the turned field that are inputs of a Gaussian process. Finer ones are noise to it.
 PROCESS_MODES = 20
 
@@ -214,6 +212,7 @@ class SteeredModel(PinModel):
 
     counts_from_rest = True
     has_modes = True
+    derived = ("fit", "order")  # they follow from the pins at rest
 
     def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> Steered:
         """See ``Model``; sizes are the fields of ``SteeredSize``."""
@@ -244,14 +243,6 @@ class SteeredModel(PinModel):
             numbers, seen = cast(Steered, network).view(*inputs.batch(rows))
         found = torch.cat([numbers, seen[:, :PROCESS_MODES]], dim=1).double().numpy()
         return Modes(found, np.zeros(len(found)))
-
-    def pack(self, weights: Weights) -> Weights:
-        """See ``Model``. Leaves out the arrays that follow from the pins at rest."""
-        return {key: value for key, value in weights.items() if key not in DERIVED}
-
-    def unpack(self, packed: Weights, blank: Weights) -> Weights:
-        """See ``Model``."""
-        return packed | {key: blank[key] for key in DERIVED}
 
 
 STEERED = SteeredModel(

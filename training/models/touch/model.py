@@ -30,7 +30,7 @@ from training.data.dataset import Dataset
 from training.data.label_code import LabelCode
 from training.data.pins import PinTable
 from training.errors import TrainingError
-from training.models.part import ArrayInputs, Inputs, Learnt, Modes, PinModel, Prepared, Recipe, Weights, refuse_sizes
+from training.models.part import ArrayInputs, Inputs, Learnt, Modes, PinModel, Prepared, Recipe, refuse_sizes
 from training.models.vgnn.registration import Registration, align, count_modes, fit_registration
 from twin.pins.labelling.reference import Reference
 
@@ -166,6 +166,7 @@ class TouchModel(PinModel):
     counts_from_rest = True
     has_modes = True
     modes_scaled = True
+    derived = ()
     sees_light = True
     unmeasured_widens = 2.0  # in the twin, a camera moved by 3 px, 1 deg and 1 % has errors 1.0 to 2.2 times those of an unmoved one
 
@@ -212,14 +213,6 @@ class TouchModel(PinModel):
         x = inputs.batch(rows)[0].double().numpy() / GAIN
         weight = np.repeat([1.0, LIGHT_WEIGHT], [2 * SIZES["modes"], SIZES["light_modes"]])
         return Modes(x * weight, np.zeros(len(x)))
-
-    def pack(self, weights: Weights) -> Weights:
-        """See ``Model``: all weights."""
-        return weights
-
-    def unpack(self, packed: Weights, blank: Weights) -> Weights:
-        """See ``Model``."""
-        return packed
 
 
 def _remove_camera_motion(

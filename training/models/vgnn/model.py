@@ -37,9 +37,6 @@ FEATURES = 3
 FILL_RIDGE = 1e-3
 # Number of modes of the displacement that are inputs of the Gaussian process, with all modes of the areas. Finer modes are noise to it.
 PROCESS_MODES = 30
-# Buffers that a small copy leaves out, because they follow from the pins. The waves are kept: waves of equal frequency can be any
-# basis of their space, and another linear algebra library would choose another one.
-DERIVED = ("adjacency", "smoothing")
 
 
 class PinInputs:
@@ -285,6 +282,9 @@ class VgnnModel(PinModel):
 
     counts_from_rest = True
     has_modes = True
+    # They follow from the pins. The waves do not: waves of equal frequency can be any basis of their space, and another linear algebra
+    # library would choose another one.
+    derived = ("adjacency", "smoothing")
 
     def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> Vgnn:
         """See ``Model``; sizes are the fields of ``VgnnSize``."""
@@ -333,15 +333,15 @@ class VgnnModel(PinModel):
         return Modes(seen, pins.displaced[rows].numpy())
 
     def pack(self, weights: Weights) -> Weights:
-        """See ``Model``. Leaves out arrays that follow from the pins' graph, and attention between pins that are not neighbours."""
-        kept = {key: value for key, value in weights.items() if key not in DERIVED}
+        """See ``Model``. Attention between pins that are not neighbours is left out, too."""
+        kept = super().pack(weights)
         if "attention" in kept:
             kept["attention"] = kept["attention"][weights["adjacency"] > 0]
         return kept
 
     def unpack(self, packed: Weights, blank: Weights) -> Weights:
         """See ``Model``."""
-        weights = packed | {key: blank[key] for key in DERIVED}
+        weights = super().unpack(packed, blank)
         if "attention" in packed:
             attention = torch.zeros_like(blank["attention"])
             attention[blank["adjacency"] > 0] = packed["attention"]

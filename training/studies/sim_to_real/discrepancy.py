@@ -186,12 +186,6 @@ class Discrepancy:
         self.sizes = np.sqrt((amplitudes[:, :kept] ** 2).mean(axis=0))
         self.processes = [_process(self._scale_axes(axes), column) for column in (amplitudes[:, :kept] / self.sizes).T]
 
-    def mean_px(self, labels: list[ArmLabel], moved_px: np.ndarray) -> np.ndarray:
-        """(S, N, 2) expected discrepancy of S simulated displacements (S, N, 2), px."""
-        scaled = self._scale_axes(label_axes(labels))
-        amplitudes = np.stack([process.mean(Points.of(scaled)) for process in self.processes], axis=1)
-        return self._fields(amplitudes, moved_px)
-
     def draw_px(self, labels: list[ArmLabel], moved_px: np.ndarray, contact: np.ndarray, seed: int) -> np.ndarray:
         """(S, N, 2) random discrepancy of S simulated displacements, px. One function is sampled for all states of a contact (S,)."""
         scaled = self._scale_axes(label_axes(labels))
@@ -221,7 +215,7 @@ class Discrepancy:
     def _scale_axes(self, axes: np.ndarray) -> np.ndarray:
         return (self._known_labels(axes)[:, self.used] - self.middle) / self.spread
 
-    def _fields(self, amplitudes: np.ndarray, moved_px: np.ndarray, rest: np.ndarray | float = 0.0) -> np.ndarray:
+    def _fields(self, amplitudes: np.ndarray, moved_px: np.ndarray, rest: np.ndarray) -> np.ndarray:
         relative = (amplitudes * self.sizes) @ self.modes + rest
         return (relative * _rms_px(moved_px)[:, None]).reshape(moved_px.shape)
 

@@ -33,7 +33,6 @@ from training.runs.assemble import intervals
 from training.runs.config import RunConfig
 from training.runs.gaussian_process import fit_two_fidelities
 from training.runs.identity import frame_marks, identity_of
-from training.runs.loop import epoch_step
 from training.runs.run import is_finished, train_run
 from training.runs.run_files import CONFIG, TENSORS, read_tensors, write_tensors
 from training.studies.judging import leak_check, measure_errors
@@ -41,7 +40,7 @@ from training.studies.sim_to_real.discrepancy import FRICTIONS, Discrepancy
 from training.studies.sim_to_real.plan import FULL, SimToRealPlan
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.frames import open_recording
-from twin.progress import Progress, Step, stage
+from twin.progress import Progress, Step, stage, unheard
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel, poses_and_moves, read_arm_labels
 from twin.store import output, overwriting, write_text, writes
@@ -261,9 +260,7 @@ def stands_and_moves(labels: Sequence[ArmLabel]) -> np.ndarray:
     return np.hstack(poses_and_moves(labels))
 
 
-def with_missing(
-    simulated: Dataset, labels: list[ArmLabel], discrepancy: Discrepancy, seed: int, *, progress: Step | None = None
-) -> Dataset:
+def with_missing(simulated: Dataset, labels: list[ArmLabel], discrepancy: Discrepancy, seed: int, *, progress: Step = unheard) -> Dataset:
     """A simulated data set with a discrepancy, sampled for each contact, added to its pins; ``labels`` are its ``arm_labels``."""
     pins = simulated.pins
     missing_px = discrepancy.draw_px(labels, pins.nodes_px - pins.reference.pins_px, contact_of(simulated), seed)
@@ -284,14 +281,7 @@ def model_for(data: Dataset) -> str:
 
 
 def train_in_twin(
-    sim: Dataset,
-    out: Path,
-    *,
-    seed: int,
-    split: int | None,
-    epochs: int | None,
-    labelled: Dataset | None = None,
-    progress: Step | None = None,
+    sim: Dataset, out: Path, *, seed: int, split: int | None, epochs: int | None, labelled: Dataset | None = None, progress: Step = unheard
 ) -> None:
     """Train a run on simulated contacts, or continue it.
 
@@ -312,15 +302,15 @@ def train_in_twin(
     _train(RunConfig(model, recipe, seed=seed, split=split, labelled=taught), sim, out, progress)
 
 
-def train_on_real(real: Dataset, out: Path, *, seed: int, epochs: int | None, progress: Step | None = None) -> None:
+def train_on_real(real: Dataset, out: Path, *, seed: int, epochs: int | None, progress: Step = unheard) -> None:
     """Train a run on all of the given real frames alone, or continue it."""
     model = model_for(real)
     _train(RunConfig(model, recipe_of(model, epochs=epochs), seed=seed, split=None), real, out, progress)
 
 
-def _train(config: RunConfig, data: Dataset, out: Path, progress: Step | None) -> None:
+def _train(config: RunConfig, data: Dataset, out: Path, progress: Step) -> None:
     if not is_finished(config, data, out):
-        train_run(config, data, out, progress=None if progress is None else epoch_step(progress))
+        train_run(config, data, out, progress=progress)
 
 
 def states_like(simulated: Dataset, labelled: Dataset) -> np.ndarray:

@@ -26,7 +26,7 @@ from twin.calibration.contact import fit_contact
 from twin.calibration.contact.simulate import CalibrationSetup
 from twin.estimate import readable_labels
 from twin.evaluation.labelled.model import MeasuredFrames
-from twin.progress import Progress, Step, silent, stage
+from twin.progress import Progress, Step, silent, stage, unheard
 from twin.report.table import write_table
 from twin.rig.labels import ArmLabel
 from twin.store import writes
@@ -47,7 +47,7 @@ def teach(
     *,
     seed: int,
     epochs: int | None,
-    progress: Step | None = None,
+    progress: Step = unheard,
 ) -> None:
     """Train a run on labelled frames and on frames whose labels that model inversion estimates, or continue it.
 

@@ -20,7 +20,7 @@ from training.estimate.estimator import PoseEstimator
 from training.models import model_named, recipe_of, variant_named
 from training.models.part import Inputs
 from training.runs.config import RunConfig
-from training.runs.loop import Loop, TrainingRows, epoch_step, parameter_count
+from training.runs.loop import Loop, TrainingRows, parameter_count
 from training.runs.run import is_finished, train_run
 from training.runs.run_files import CHECKPOINT, TENSORS, read_config
 from training.studies.judging import measure_errors, rows_to_evaluate
@@ -97,7 +97,7 @@ def train_all(
                 continue
         begun = monotonic()
         with stage(progress, plan.name) as step:
-            train_run(plan.config, data, folder, max_minutes=share, device=device, progress=epoch_step(step))
+            train_run(plan.config, data, folder, max_minutes=share, device=device, progress=step)
         spent[plan.folder] = (monotonic() - begun) / 60
     return spent
 

@@ -31,7 +31,7 @@ from twin.mechanics.path import ContactPath, ContactPose, plan_path
 from twin.objects import build_field
 from twin.pins import Pipeline, make_graph
 from twin.pins.graph import GraphKind
-from twin.progress import Progress, Step, silent, stage
+from twin.progress import Progress, Step, silent, stage, unheard
 from twin.report.charts import new_figure, write_chart
 from twin.report.plots import draw_area_change
 from twin.report.table import write_table
@@ -129,7 +129,7 @@ class AreaChange:
         return row | {"growth_x_px": float(where[0]), "growth_y_px": float(where[1])}
 
 
-def twin_contacts(spec: SensorSpec, form: Form, *, progress: Step | None = None) -> list[AreaChange]:
+def twin_contacts(spec: SensorSpec, form: Form, *, progress: Step = unheard) -> list[AreaChange]:
     """Simulate and render every contact at every depth, find its pins, and compute their Voronoi cells.
 
     Raises
@@ -152,8 +152,7 @@ def twin_contacts(spec: SensorSpec, form: Form, *, progress: Step | None = None)
             if not seen.valid or seen.graph is None:
                 raise TwinError(f"{spec.name}, {name}, {depth:g} mm: {seen.reason}")
             found.append(AreaChange(name, depth, seen.graph, rest.graph.area_px2))
-            if progress:
-                progress(len(found), len(CONTACTS) * len(DEPTHS_MM))
+            progress(len(found), len(CONTACTS) * len(DEPTHS_MM))
     return found
 
 

@@ -15,7 +15,6 @@ from twin.frames.forms import levels_at, raw_to_recording
 from twin.pins import Pipeline, measure_reference, nominal_reference
 from twin.pins.detectors.legacy import LegacyPipeline
 from twin.pins.finding.blobs import SPECK_LEVELS, circular_mask, despeckle, find_blobs
-from twin.pins.finding.components import find_components
 from twin.pins.labelling.matching import confirm, match, rematch
 from twin.pins.labelling.reference import folded_fraction
 from twin.pins.labelling.split import split_chains
@@ -599,16 +598,6 @@ def test_share_of_pins_between_caps_is_that_of_plain_arrays():
         above = levels_at(smooth, px[known]) - np.nanpercentile(between[known], 35, axis=1)
         plain = np.mean(above <= LEAST_ABOVE * np.percentile(above, 75)) if known.any() else 0.0
         assert share_between(gray, px, near, 35, 75) == plain
-
-
-def test_components_are_those_of_opencv():
-    """The same labels, numbers and boxes in pictures of any size and density."""
-    rng = np.random.default_rng(7)
-    for share in (0.02, 0.1, 0.3, 0.5, 0.7, 0.98) * 10:
-        bright = (255 * (rng.random(rng.integers(1, 70, 2)) < share)).astype(np.uint8)
-        _, expected, stats, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
-        labels, boxes = find_components(bright)
-        assert np.array_equal(labels, expected) and np.array_equal(boxes[1:], stats[1:])
 
 
 def test_following_a_sequence_gives_the_observations_of_the_full_search(pipeline):

@@ -1,40 +1,19 @@
 """The signed-distance field of an object from its specification, including a wire mesh on its surface if it has one."""
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from scenes.object import CylinderShape, EdgeShape, MeshShape, ObjectSpec, PlaneShape, PrismShape, SphereShape
 from twin.compiled import compiled
 from twin.objects.analytic import Cylinder, Edge, Plane, Prism, Sphere
-from twin.objects.level_set import Probe, Probed, Wrapped, unit_normals
+from twin.objects.level_set import ObjectField, Probe, Wrapped, unit_normals
 from twin.types import FloatArray
 
 _BLEND = 0.15
 """Length over which wires and base are blended into each other, as a share of the wire's diameter."""
 _CREASE_MM = 1e-3
 """Distance from a wire's axis below which the field's curvature counts as 0, because it has no limit there."""
-
-
-class ObjectField(Protocol):
-    """A solid in the object frame, as a signed-distance field at points (k, 3) in mm."""
-
-    def distance(self, points_mm: FloatArray) -> FloatArray:
-        """(k,) in mm, positive outside."""
-        ...
-
-    def gradient(self, points_mm: FloatArray) -> FloatArray:
-        """(k, 3) unit, outwards."""
-        ...
-
-    def probe(self, points_mm: FloatArray) -> Probe:
-        """Distance (k,), gradient (k, 3) and Hessian (k, 3, 3) in 1/mm, in one evaluation.
-
-        The Hessian is the second derivative of the distance. It is symmetric, the gradient is in its null space, and it is zero across
-        creases. If a field is not an exact distance, it is the derivative of the unit gradient along the level set.
-        """
-        ...
 
 
 def build_field(spec: ObjectSpec) -> ObjectField:
@@ -68,7 +47,7 @@ def build_field(spec: ObjectSpec) -> ObjectField:
 
 
 @dataclass(frozen=True)
-class WireMesh(Probed):
+class WireMesh(ObjectField):
     """Round wires that lie on the base's surface in two crossing families; one wire of each family passes over the origin.
 
     The distance to a wire is sqrt((D - d/2)^2 + s^2) - d/2, where D is the base's distance, d the wire's diameter and s the distance

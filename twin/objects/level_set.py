@@ -16,12 +16,16 @@ _FLAT = 1e-12
 """Length of a field's gradient below which it has no usable direction."""
 
 
-class Probed(ABC):
-    """A signed-distance field whose ``probe`` gives distance, unit gradient and Hessian at once."""
+class ObjectField(ABC):
+    """A solid in the object frame, as a signed-distance field at points (k, 3) in mm."""
 
     @abstractmethod
     def probe(self, points_mm: FloatArray) -> Probe:
-        """Distance (k,) in mm, unit gradient (k, 3) and Hessian (k, 3, 3) in 1/mm at points (k, 3)."""
+        """Distance (k,), gradient (k, 3) and Hessian (k, 3, 3) in 1/mm, in one evaluation.
+
+        The Hessian is the second derivative of the distance. It is symmetric, the gradient is in its null space, and it is zero across
+        creases. If a field is not an exact distance, it is the derivative of the unit gradient along the level set.
+        """
 
     def distance(self, points_mm: FloatArray) -> FloatArray:
         """(k,) in mm, positive outside."""
@@ -32,7 +36,7 @@ class Probed(ABC):
         return self.probe(points_mm)[1]
 
 
-class Wrapped(Probed):
+class Wrapped(ObjectField):
     """A field on whose surface a texture can be laid."""
 
     def unroll(self, points_mm: FloatArray) -> Probe:

@@ -54,45 +54,13 @@ class Net:
         return found
 
 
-@compiled()
 def directed_edges(triangles: np.ndarray, n: int) -> np.ndarray:
     """Directed edges (E, 2), sorted: both directions of each side of the triangles over ``n`` nodes. Nodes from ``n`` on are left out."""
-    start = np.zeros(n + 1, np.int64)
-    for t in range(len(triangles)):
-        for k in range(3):
-            if triangles[t, k] < n:
-                start[triangles[t, k] + 1] += 2
-    start = np.cumsum(start)
-    fill = start[:-1].copy()
-    ends = np.empty(start[-1], np.int64)
-    for t in range(len(triangles)):
-        for k in range(3):
-            i, j = triangles[t, k], triangles[t, (k + 1) % 3]
-            if i < n and j < n and triangles[t, (k + 2) % 3] < n:
-                _insert(ends, start[i], fill, i, j)
-                _insert(ends, start[j], fill, j, i)
-    edges = np.empty((len(ends), 2), np.int64)
-    count = 0
-    for i in range(n):
-        for k in range(start[i], fill[i]):
-            edges[count, 0] = i
-            edges[count, 1] = ends[k]
-            count += 1
-    return edges[:count]
-
-
-@compiled()
-def _insert(ends: np.ndarray, first: int, fill: np.ndarray, i: int, j: int) -> None:
-    """Put node j among the sorted ends of node i's edges, once: a side of two triangles occurs twice."""
-    k = fill[i]
-    while k > first and ends[k - 1] > j:
-        k -= 1
-    if k > first and ends[k - 1] == j:
-        return
-    for later in range(fill[i], k, -1):
-        ends[later] = ends[later - 1]
-    ends[k] = j
-    fill[i] += 1
+    corners = triangles[(triangles < n).all(axis=1)].astype(np.int64)
+    starts, ends = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
+    joined = np.zeros(n * n, bool)
+    joined[starts * n + ends] = joined[ends * n + starts] = True
+    return np.column_stack(np.divmod(np.flatnonzero(joined), n))
 
 
 def net_of(triangles: np.ndarray, n: int) -> Net | None:

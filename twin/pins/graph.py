@@ -33,7 +33,7 @@ def _delaunay_edges(nodes_px: np.ndarray, net: Net | None) -> np.ndarray | None:
     if moved is not None:
         return moved.edges
     triangles = triangulate(nodes_px)
-    return None if triangles is None else np.asarray(directed_edges(triangles, len(nodes_px)))
+    return None if triangles is None else directed_edges(triangles, len(nodes_px))
 
 
 def make_graph(kind: GraphKind, nodes_px: np.ndarray, *, outmost: np.ndarray | None = None, net: Net | None = None) -> PinGraph:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from cycler import cycler
-from matplotlib import RcParams, colormaps, rc_context
+from matplotlib import RcParams, colormaps, rc_context, rc_params_from_file
 from matplotlib.axis import Axis
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
@@ -24,6 +24,8 @@ SHADES = 256
 # Ratio of an axis' largest to its smallest value below which labels at powers of ten alone are too few.
 FEW_DECADES = 100.0
 
+_FORM = rc_params_from_file(Path(__file__).with_name("charts.mplstyle"), use_default_template=False)
+"""The part of the style that is the same in all themes."""
 _theme: ContextVar[Theme] = ContextVar("theme", default=LIGHT)
 
 
@@ -111,38 +113,19 @@ def plain_log(axis: Axis) -> None:
 
 def _style(theme: Theme) -> RcParams:
     panes = {f"axes3d.{axis}axis.panecolor": theme.page for axis in "xyz"}
-    return RcParams(
-        panes
-        | {
-            "figure.facecolor": theme.surface,
-            "savefig.facecolor": theme.surface,
-            "axes.facecolor": theme.surface,
-            "axes.edgecolor": theme.muted,
-            "axes.labelcolor": theme.ink,
-            "axes.titlecolor": theme.ink,
-            "text.color": theme.ink,
-            "xtick.color": theme.muted,
-            "ytick.color": theme.muted,
-            "xtick.labelcolor": theme.ink,
-            "ytick.labelcolor": theme.ink,
-            "axes.grid": True,
-            "axes.axisbelow": True,
-            "grid.color": theme.line,
-            "grid.linewidth": 0.7,
-            "axes.spines.top": False,
-            "axes.spines.right": False,
-            "axes.linewidth": 0.8,
-            "axes.prop_cycle": cycler(color=SERIES),
-            "axes.titlesize": 10.5,
-            "axes.titleweight": "bold",
-            "axes.titlelocation": "left",
-            "axes.labelsize": 9.5,
-            "figure.titlesize": 11.5,
-            "figure.titleweight": "bold",
-            "font.size": 9.5,
-            "legend.frameon": False,
-            "legend.fontsize": 8.5,
-            "lines.linewidth": 1.6,
-            "lines.markersize": 5,
-        }
-    )
+    colours = {
+        "figure.facecolor": theme.surface,
+        "savefig.facecolor": theme.surface,
+        "axes.facecolor": theme.surface,
+        "axes.edgecolor": theme.muted,
+        "axes.labelcolor": theme.ink,
+        "axes.titlecolor": theme.ink,
+        "text.color": theme.ink,
+        "xtick.color": theme.muted,
+        "ytick.color": theme.muted,
+        "xtick.labelcolor": theme.ink,
+        "ytick.labelcolor": theme.ink,
+        "grid.color": theme.line,
+        "axes.prop_cycle": cycler(color=SERIES),
+    }
+    return RcParams(_FORM | panes | colours)

@@ -7,7 +7,6 @@ process makes its own test.
 
 import ctypes
 import importlib.metadata
-import json
 import os
 import subprocess
 import sys
@@ -18,7 +17,7 @@ from functools import cache
 from pathlib import Path
 
 from twin.errors import StoreError
-from twin.store import cache_folder, fingerprint, write_json
+from twin.store import Item, cache_folder, find_json, keep_json
 
 PRIVATE_FOLDER = Path(sys.prefix) / "lib" / "private"
 """Folder for the copies of libraries that 'make setup' makes if it has no permission to install them."""
@@ -77,26 +76,19 @@ class ProbeResult:
 
 def probe(backend: str, library: Path, *, remember_failure: bool = True) -> ProbeResult:
     """Run a tiny kernel on ``backend`` ("llvm" or "cuda") with ``library``, or return the stored result."""
-    key = "|".join(
-        [
-            backend,
-            str(library),
-            str(library.stat().st_mtime_ns),
-            importlib.metadata.version("drjit"),
-            fingerprint(__name__),
-            os.environ.get("CUDA_VISIBLE_DEVICES", "") if backend == "cuda" else "",
-        ]
-    )
+    devices = os.environ.get("CUDA_VISIBLE_DEVICES", "") if backend == "cuda" else ""
+    tried = [str(library), library.stat().st_mtime_ns, importlib.metadata.version("drjit"), devices]
+    item = Item(f"backend-{backend}", (__name__,), tried)
     folder = cache_folder()
     if folder is None:
-        return _run_once(key, backend, library)
-    store = folder / "backend-probes.json"
-    known = _read(store)
-    if key in known:
-        return ProbeResult(**known[key])
+        return _run_once(item.file, backend, library)
+    known = find_json(folder, item)
+    if known is not None:
+        return ProbeResult(**known)
     verdict = _run(backend, library)
     if verdict.ok or remember_failure:
-        _write(store, _read(store) | {key: asdict(verdict)})
+        with suppress(StoreError):  # if the cache can't be written, the next start probes again
+            keep_json(folder, item, asdict(verdict))
     return verdict
 
 
@@ -124,18 +116,3 @@ def _run(backend: str, library: Path) -> ProbeResult:
     telling = [line for line in lines if "LLVM ERROR" in line or "Error" in line or "failed" in line] or lines[-1:] or ["no message"]
     how = f"killed by signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
     return ProbeResult(False, "", f"a tiny kernel does not run ({how}: {telling[0][:160]})")
-
-
-def _read(store: Path) -> dict:
-    try:
-        known = json.loads(store.read_text(encoding="utf-8"))
-        return known if isinstance(known, dict) else {}
-    except (OSError, ValueError):
-        return {}
-
-
-def _write(store: Path, verdicts: dict) -> None:
-    """Store the verdicts. If the cache can't be written, no error is raised and the next start probes again."""
-    with suppress(OSError, StoreError):
-        store.parent.mkdir(parents=True, exist_ok=True)
-        write_json(store, verdicts)

@@ -376,8 +376,6 @@ def grasp(
     arm: str = ...,
     object_mm: float = ...,
     safety: str | None = ...,
-    seed: int = ...,
-    plain_light: bool = ...,
     also: str | Sequence[str] | None = ...,
     force: bool = ...,
     progress: Progress | bool | None = ...,

@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Protocol, cast
+from typing import cast
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from hardware.safety.decide import Sensed
 from hardware.safety.eyes import ArmWatch, FreshFrames
 from hardware.safety.safe_arm import SafeArm, try_each
 from hardware.servo.grippers import Gripper, open_gripper
-from hardware.workcell.build import FRAME_S, TWIN_FRAME_S, draw_window, open_guarded_arm
+from hardware.workcell.build import FRAME_S, TWIN_FRAME_S, open_guarded_arm
 from scenes.files import quote
 from scenes.sensor import SensorSpec
 from twin.errors import OptionError
@@ -161,14 +161,6 @@ def run_gripper(
     return found
 
 
-class GripPolicy(Protocol):
-    """A ``Decide`` of a task with an end."""
-
-    steps: int
-
-    def __call__(self, step: GripStep, /) -> tuple[np.ndarray, float]: ...
-
-
 @dataclass(frozen=True)
 class GripPlan:
     """Settings of a run, and its devices.
@@ -183,10 +175,6 @@ class GripPlan:
         Cameras, as for ``open_camera``.
     arm, limits : str
         As for ``build_rig``.
-    seed : int
-        Seed of the noise of a scene's frames.
-    plain_light : bool
-        Draw a scene's frames without path tracing.
     also : tuple of str
         Further formats in which the records are kept.
     """
@@ -197,8 +185,6 @@ class GripPlan:
     right: str = ""
     arm: str = "simulated"
     limits: str | None = None
-    seed: int = 0
-    plain_light: bool = False
     also: tuple[str, ...] = ()
 
     @property
@@ -220,13 +206,9 @@ class GripPlan:
         if worlds and (any(cameras.values()) or kind_of(self.arm) != "simulated"):
             raise OptionError(f"`gripper` {quote(self.gripper)} is in a scene; leave out `left`, `right` and `arm`, or give a real gripper")
         if worlds:
-            sources: dict[str, FrameSource] = {}
-            for number, (name, world) in enumerate(worlds.items(), self.seed):
-                preview = draw_window(self.sensor, self.form, self.plain_light)
-                sources[name] = TwinCamera(
-                    self.sensor, None, arm.state, self.form, seed=number, preview=preview, on_demand=True, world=world
-                )
-            return GripperRig(sources, arm, gripper)
+            draw = partial(TwinCamera, self.sensor, None, arm.state, self.form, on_demand=True)
+            of = {name: draw(seed=number, world=world) for number, (name, world) in enumerate(worlds.items())}
+            return GripperRig(of, arm, gripper)
         if not all(cameras.values()):
             raise OptionError(f"`gripper` {quote(self.gripper)} is real; give the sensors' cameras with `left` and `right`")
         return GripperRig({name: open_camera(text, self.sensor, self.form) for name, text in cameras.items()}, arm, gripper)
@@ -250,8 +232,8 @@ class Gripped:
 
 
 @writes("left", "right", *ALSO)
-def grip(plan: GripPlan, policy: GripPolicy, out: Path, *, period_s: float, progress: Progress = silent) -> Gripped:
-    """Run a policy until its end, and write the records to ``out``: a session for each sensor, and all of them in further formats.
+def grip(plan: GripPlan, policy: Decide, out: Path, *, steps: int, period_s: float = 0.0, progress: Progress = silent) -> Gripped:
+    """Run a policy, and write the records to ``out``: a session for each sensor, and all of them in further formats.
 
     Raises
     ------
@@ -264,12 +246,12 @@ def grip(plan: GripPlan, policy: GripPolicy, out: Path, *, period_s: float, prog
 
         def decide(step: GripStep) -> tuple[np.ndarray, float]:
             found.append(step)
-            report(step.index, policy.steps)
+            report(step.index, steps)
             return policy(step)
 
         try:
             timeout_s = TWIN_FRAME_S if any(isinstance(source, TwinCamera) for source in rig.sources.values()) else FRAME_S
-            run_gripper(rig, pipelines, decide, steps=policy.steps, out=out, period_s=period_s, timeout_s=timeout_s)
+            run_gripper(rig, pipelines, decide, steps=steps, out=out, period_s=period_s, timeout_s=timeout_s)
         finally:
             if len(found) > 1:  # a step is written after its move
                 kept.catch_up()

@@ -440,11 +440,10 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--device": "tpu",
     },
 }
-NUMBERS["grasp {grasp_policy} --plain-light --out {out}"] = {
+NUMBERS["grasp {grasp_policy} --out {out}"] = {
     "--gripper": "nonsense output:x,40,10 ros2:/topic,x mujoco:nowhere",
     "--object-mm": "0 x nan",
     "--arm": "nonsense",
-    "--seed": "-1",
 }
 SAMPLED_NUMBERS = ("--kind star", "--max-frames -1", "--hold nonsense", "--elements 7")
 
@@ -520,7 +519,7 @@ WRITE = {
     "demonstrate": f"demonstrate --task GentlePress {S} --episodes 1 --out {{there}}",
     "learn": f"learn --task SurfaceFollow {S} --minutes 0.02 --environments 2 --out {{there}}",
     "policy": "policy {policy} --object can --steps 1 --plain-light --out {there}",
-    "grasp": "grasp {grasp_policy} --plain-light --out {there}",
+    "grasp": "grasp {grasp_policy} --out {there}",
     "surrogate": f"surrogate {S} --paths 10 --workers 1 --out {{there}}/mine.safetensors",
     "study objects": f"study objects {S} --count 2 --tests 1 --elements 6 --workers 1 --epochs 1 --out {{there}}",
     "study sim-to-real": f"study sim-to-real {S} --frames {{recording}} --num-labelled 12 --count 10 --epochs 1 --workers 1 "

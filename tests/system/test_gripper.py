@@ -194,14 +194,9 @@ def grasped(tmp_path_factory):
     observed, exact, out = [], [], tmp_path_factory.mktemp("grasp") / "out"
     policy = GraspPolicy(lambda seen: observed.append(seen) or np.array([float(len(observed) <= CLOSINGS)]), 40.0)
 
-    class Watched:
-        """The same policy; it notes the scene's own pins."""
-
-        steps = GRASP_STEPS
-
-        def __call__(self, step):
-            exact.append([scene.read(site).pins_px for site in scene.sensors])
-            return policy(step)
+    def watched(step):
+        exact.append([scene.read(site).pins_px for site in scene.sensors])
+        return policy(step)
 
     class Watching(GripPlan):
         def build(self):
@@ -211,8 +206,8 @@ def grasped(tmp_path_factory):
             return rig
 
     scene = None
-    plan = Watching(load_sensor(SENSOR), plain_light=True, also=("lerobot", "mcap"))
-    return out, grip(plan, Watched(), out, period_s=PERIOD_S), observed, exact
+    plan = Watching(load_sensor(SENSOR), also=("lerobot", "mcap"))
+    return out, grip(plan, watched, out, steps=GRASP_STEPS, period_s=PERIOD_S), observed, exact
 
 
 def test_a_policy_of_the_environment_runs_live_on_what_the_environment_observes(grasped):

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from scenes.files import LONGEST_PATH, quote
 from scenes.plugins import others
 from twin.errors import extras_named
 from twin.policy import PolicyError
-from twin.types import FloatArray, Observation
+from twin.types import FloatArray
 
 PERIOD_S = 0.05
 """Time between two decisions."""
@@ -78,18 +78,6 @@ class GraspHand:
         return [(self.fingers_mm - TOUCHING_MM) / 5.0, self.hand_mm / LIFT_MM, self.done / STEPS]
 
 
-class SensedStep(Protocol):
-    """A step of a loop with two sensors (``hardware.servo.grip.GripStep``)."""
-
-    @property
-    def index(self) -> int:
-        """Its number."""
-
-    @property
-    def pins(self) -> Mapping[str, Observation]:
-        """Each sensor's valid pins."""
-
-
 class GraspPolicy:
     """Decides in a loop with two sensors and a gripper on an arm.
 
@@ -111,12 +99,12 @@ class GraspPolicy:
         self._rest_px: list[FloatArray] = []
         self._touch: FloatArray | None = None
 
-    def __call__(self, step: SensedStep) -> tuple[FloatArray, float]:
-        """The tool's motion (6,), mm and deg, and the gripper's next width, mm."""
+    def __call__(self, step: Any) -> tuple[FloatArray, float]:
+        """The tool's motion (6,), mm and deg, and the gripper's next width, mm, for a step (``hardware.servo.grip.GripStep``)."""
         motion, touching_mm = np.zeros(6), self._object_mm - 2 * TOUCH_DEPTH_MM
         if step.index < SETTLE_STEPS:
             return motion, self._object_mm + 2 * CLEAR_MM
-        pins_px = [seen.graph.nodes_px for seen in step.pins.values() if seen.graph is not None]
+        pins_px = [seen.graph.nodes_px for seen in step.pins.values()]
         if step.index == SETTLE_STEPS:
             self._rest_px = pins_px
         if step.index < 2 * SETTLE_STEPS:

@@ -293,8 +293,6 @@ def grasp(
     arm: ArmOption = "simulated",
     object_mm: Annotated[float, typer.Option(min=1, max=200, help="width of the object between the fingers")] = 40.0,
     safety: Limits = None,
-    seed: NoiseSeed = 0,
-    plain_light: options.PlainLight = False,
     also: options.Also = None,
     *,
     progress: Progress,
@@ -325,7 +323,7 @@ def grasp(
 
     plan, decide = call(GripPlan, locals()), GraspPolicy(load_grasp_policy(policy), object_mm)
     with signals_as_ctrl_c():
-        return grip(plan, decide, out, period_s=PERIOD_S, progress=progress)
+        return grip(plan, decide, out, steps=decide.steps, period_s=PERIOD_S, progress=progress)
 
 
 emulate = App(

@@ -184,9 +184,7 @@ class About:
         known = {*CHANNELS, *(f"pins.{view}" for view in about.views)}
         if not set(about.numbers) <= known or not about.views or not all(0 < count < 1_000_000 for count in about.numbers.values()):
             raise ValueError("unknown channels")
-        order = list(CHANNELS)
-        names = sorted(about.numbers, key=lambda name: order.index(name.partition(".")[0]))
-        return replace(about, numbers={name: about.numbers[name] for name in names})
+        return about
 
     def differs(self, other: "About") -> list[str]:
         """Reasons why episodes of another record do not fit into this one."""

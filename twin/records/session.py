@@ -304,15 +304,8 @@ def session_records(folder: Path) -> Records:
 
 
 # Keys of a step's line that hold the numbers of a channel.
-_KEYS = {
-    "pins": ("pins",),
-    "pose": ("exposed_pose",),
-    "estimate": ("value",),
-    "low": ("low",),
-    "high": ("high",),
-    "width": ("width_mm",),
-    "action": ("sent", "sent_mm"),
-}
+_KEYS: dict[str, tuple[str, ...]] = {"pins": ("pins",), "pose": ("exposed_pose",), "width": ("width_mm",), "action": ("sent", "sent_mm")}
+_KEYS |= {"estimate": ("value",), "low": ("low",), "high": ("high",)}
 
 
 def rig_records(folder: Path) -> Records | None:

@@ -51,7 +51,7 @@ rig = build_rig(simulator.spec, plane, placement, how, camera="example:frames", 
 print("guard", type(rig.arm).__name__, rig.arm.name)
 from hardware.servo.grip import GripPlan
 from training.environments.grasp import load_grasp_policy
-plan = GripPlan(twin.load_sensor("mg400-331"), gripper="example:there", left="example:frames", right="example:frames", arm="example:here")
+plan = GripPlan(simulator.spec, gripper="example:there", left="example:frames", right="example:frames", arm="example:here")
 print("gripper", plan.build().gripper.name, load_grasp_policy("example-grip")({"tactile": np.zeros((2, 2, 331, 2))}))
 try: twin.open_arm("nobody:")
 except twin.errors.TwinError as error: print("arms", "example" in str(error))

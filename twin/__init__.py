@@ -17,7 +17,7 @@ how true it is  validate realism robustness audit
 models          make_dataset train evaluate predict load_model
 policies        register_environments BaselinesVecEnv demonstrate learn
 robot scenes    TactileScene attach_sensor load_scene write_urdf
-devices         open_camera open_arm SafeArm load_limits collect servo run_policy
+devices         open_camera open_arm SafeArm load_limits collect servo run_policy grasp
 other           errors extend __version__
 
 A function such as `train` does what the command of its name does. It takes the command's options as keyword arguments, and returns a
@@ -44,7 +44,7 @@ _OFFERED = {
     "twin.cli.calibration": ("audit", "calibrate_contact", "calibrate_optics", "new_sensor", "realism", "record", "robustness", "validate"),
     "twin.cli.frames": ("check", "preprocess", "tune"),
     "twin.cli.learning": ("demonstrate", "evaluate", "learn", "make_dataset", "predict", "train"),
-    "twin.cli.live": ("collect", "run_policy", "servo"),
+    "twin.cli.live": ("collect", "grasp", "run_policy", "servo"),
     "twin.mechanics.path": ("ContactPose",),
     "twin.pins.graph": ("node_features",),
     "twin.pins.pipeline": ("Pipeline",),

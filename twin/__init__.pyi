@@ -12,6 +12,7 @@ from hardware.live.examining import Examination as Examination
 from hardware.safety.decide import load_limits as load_limits
 from hardware.safety.safe_arm import SafeArm as SafeArm
 from hardware.servo.following import Followed as Followed
+from hardware.servo.grip import Gripped as Gripped
 from scenes import ExperimentSpec as ExperimentSpec
 from scenes import ObjectSpec as ObjectSpec
 from scenes import SensorSpec as SensorSpec
@@ -363,6 +364,22 @@ def collect(
     force: bool = ...,
     progress: Progress | bool | None = ...,
 ) -> Collected: ...
+
+def grasp(
+    policy: str,
+    *,
+    out: Path | str,
+    sensor: str | Path | SensorSpec = ...,
+    gripper: str = ...,
+    left: str = ...,
+    right: str = ...,
+    arm: str = ...,
+    object_mm: float = ...,
+    safety: str | None = ...,
+    also: str | Sequence[str] | None = ...,
+    force: bool = ...,
+    progress: Progress | bool | None = ...,
+) -> Gripped: ...
 
 def run_policy(
     policy: Path | str,

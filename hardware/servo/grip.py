@@ -1,65 +1,41 @@
 """A loop for several sensors on a gripper that an arm carries: a frame of each sensor, their pins, a decision, a move and a width.
 
 The arm moves only while all cameras give fresh frames. If one does not, or its pins are not found, arm and gripper hold still, and the loop
-ends with an error if that lasts. At the end the arm is stopped and disabled; the gripper keeps its width, so that it drops nothing.
+ends with an error if that lasts. At the end the arm is stopped and disabled; the gripper keeps its width, so that it drops nothing. A
+``SafeArm`` checks the workspace, the step, the speed and the age of the oldest frame before each move. It gets no depth and no force: the
+arm does not press the sensors, the gripper does. Only the policy and the gripper's own limit of force guard the grip.
 """
 
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Protocol, cast
+from typing import cast
 
 import numpy as np
 
 from hardware.arms.arm import Arm, ArmState
-from hardware.arms.mg400 import MG400
+from hardware.arms.open_arm import kind_of
+from hardware.cameras.choose import open_camera
 from hardware.cameras.source import FrameSource, no_frame
+from hardware.cameras.twin import TwinCamera
 from hardware.errors import DeviceError
+from hardware.safety.decide import Sensed
 from hardware.safety.eyes import ArmWatch, FreshFrames
 from hardware.safety.safe_arm import SafeArm, try_each
+from hardware.servo.grippers import Gripper, open_gripper
+from hardware.workcell.build import FRAME_S, TWIN_FRAME_S, open_guarded_arm
+from scenes.files import quote
+from scenes.sensor import SensorSpec
+from twin.errors import OptionError
 from twin.pins import Pipeline
+from twin.progress import Progress, silent, stage
+from twin.records import ALSO, KeptAlso
 from twin.records.session import SessionWriter
-from twin.types import Frame, Observation
-
-
-class Gripper(Protocol):
-    """A parallel gripper. It is connected with the arm."""
-
-    name: str
-
-    @property
-    def width_mm(self) -> float:
-        """The width that was commanded last."""
-
-    def move(self, width_mm: float) -> None:
-        """Open or close to a width, as near to it as the gripper can. It returns at once."""
-
-
-class OutputGripper:
-    """A gripper that is open or closed, at a digital output of an MG400.
-
-    Parameters
-    ----------
-    arm : MG400 or SafeArm
-    output : int
-        Number of the output; its level is 1 while the gripper is closed.
-    open_mm, closed_mm : float
-        Its two widths. A width nearer to ``closed_mm`` closes it.
-    """
-
-    def __init__(self, arm: Arm, output: int, *, open_mm: float, closed_mm: float) -> None:
-        device = arm.arm if isinstance(arm, SafeArm) else arm
-        if not isinstance(device, MG400):
-            raise DeviceError(f"{arm.name}: has no digital outputs for a gripper; give an MG400")
-        self.name, self.width_mm = f"gripper at output {output} of {arm.name}", open_mm
-        self._arm, self._output, self._widths = device, output, (open_mm, closed_mm)
-
-    def move(self, width_mm: float) -> None:
-        self.width_mm = min(self._widths, key=lambda width: abs(width - width_mm))
-        self._arm.set_output(self._output, self.width_mm == self._widths[1])
+from twin.store import writes
+from twin.types import Form, Frame, Observation
 
 
 @dataclass(frozen=True)
@@ -106,7 +82,8 @@ def run_gripper(
     steps: int,
     out: Path | None = None,
     speed: tuple[float, float] = (50.0, 30.0),
-    timeout_s: float = 5.0,
+    period_s: float = 0.0,
+    timeout_s: float = FRAME_S,
     give_up_s: float = 3.0,
 ) -> list[GripStep]:
     """Run a policy on a gripper with several sensors.
@@ -121,6 +98,8 @@ def run_gripper(
         New folder for the records: for each sensor a session, whose lines have the same steps, with its pins.
     speed : (float, float)
         mm/s and deg/s.
+    period_s : float
+        Least time between two decisions.
     timeout_s, give_up_s : float
         Longest wait for a frame, and longest time without valid pins.
 
@@ -149,10 +128,12 @@ def run_gripper(
         stack.callback(lambda: try_each(stop=rig.arm.stop, disable=rig.arm.disable))
         stack.enter_context(watch.watching())
         stack.enter_context(eyes.watching())
-        asked_s = valid_s = time.monotonic()
+        asked_s = due_s = time.monotonic()
+        valid_s = np.inf  # the patience begins with the first frames
         while len(found) < steps:
             with no_frame():
                 frames = {name: watch.frame_after(source, asked_s, timeout_s=timeout_s) for name, source in rig.sources.items()}
+            valid_s = min(valid_s, time.monotonic())
             pins = {name: pipelines[name](frame) for name, frame in frames.items()}
             asked_s = time.monotonic()
             if reasons := [f"{name}: {each.reason}" for name, each in pins.items() if not each.valid]:
@@ -163,13 +144,115 @@ def run_gripper(
                 eyes.await_frame(timeout_s=timeout_s)
                 rig.arm.enable()
                 rig.arm.set_speed(*speed)
+            if isinstance(rig.arm, SafeArm):
+                rig.arm.sense(Sensed(np.nan, min(frame.time_s for frame in frames.values())))
             step = GripStep(len(found), rig.arm.state(), rig.gripper.width_mm, frames, pins)
             motion, width_mm = decide(step)
             sent = eyes.move(partial(rig.arm.move_linear, step.state.pose + motion))
             rig.gripper.move(width_mm)
             found.append(step)
-            asked_s = valid_s = time.monotonic()
-            line = {"index": step.index, "time_s": asked_s, "pose": step.state.pose, "sent": sent, "width_mm": width_mm}
+            line = {"index": step.index, "time_s": time.monotonic(), "exposed_pose": step.state.pose, "sent": sent}
+            line |= {"width_mm": step.width_mm, "sent_mm": rig.gripper.width_mm}
             for name, record in records.items():
                 record.append(frames[name], line | {"pins": pins[name].pins_px})
+            time.sleep(max(0.0, due_s - time.monotonic()))
+            asked_s = valid_s = time.monotonic()
+            due_s = max(due_s, asked_s) + period_s
     return found
+
+
+@dataclass(frozen=True)
+class GripPlan:
+    """Settings of a run, and its devices.
+
+    Attributes
+    ----------
+    sensor : SensorSpec
+        That of both fingers.
+    gripper : str
+        As for ``open_gripper``. A gripper of a scene moves its hand as the simulated arm goes, and brings the sensors' cameras.
+    left, right : str
+        Cameras, as for ``open_camera``.
+    arm, limits : str
+        As for ``build_rig``.
+    also : tuple of str
+        Further formats in which the records are kept.
+    """
+
+    sensor: SensorSpec
+    gripper: str = "mujoco:gripper"
+    left: str = ""
+    right: str = ""
+    arm: str = "simulated"
+    limits: str | None = None
+    also: tuple[str, ...] = ()
+
+    @property
+    def form(self) -> Form:
+        """Form of the frames."""
+        return Form.PROCESSED if self.sensor.recording else Form.RAW
+
+    def build(self) -> GripperRig:
+        """The rig.
+
+        Raises
+        ------
+        DeviceError, OptionError
+            A part is not known, or they don't fit together.
+        """
+        arm, cameras = open_guarded_arm(self.arm, self.limits, at_once=True), {"left": self.left, "right": self.right}
+        gripper = open_gripper(self.gripper, arm, self.sensor)
+        worlds = {site.removesuffix("_tactip"): world for site, world in getattr(gripper, "worlds", dict)().items()}
+        if worlds and (any(cameras.values()) or kind_of(self.arm) != "simulated"):
+            raise OptionError(f"`gripper` {quote(self.gripper)} is in a scene; leave out `left`, `right` and `arm`, or give a real gripper")
+        if worlds:
+            draw = partial(TwinCamera, self.sensor, None, arm.state, self.form, on_demand=True)
+            of = {name: draw(seed=number, world=world) for number, (name, world) in enumerate(worlds.items())}
+            return GripperRig(of, arm, gripper)
+        if not all(cameras.values()):
+            raise OptionError(f"`gripper` {quote(self.gripper)} is real; give the sensors' cameras with `left` and `right`")
+        return GripperRig({name: open_camera(text, self.sensor, self.form) for name, text in cameras.items()}, arm, gripper)
+
+
+@dataclass(frozen=True)
+class Gripped:
+    """The result of ``grip``: its steps, and the folders of the records."""
+
+    steps: list[GripStep]
+    written: list[Path] = field(default_factory=list)
+
+    def lines(self) -> list[str]:
+        """The result as lines of text."""
+        heights_mm, first, last = [step.state.pose[2] for step in self.steps], self.steps[0], self.steps[-1]
+        spent_s = last.state.time_s - first.state.time_s
+        return [
+            f"{len(self.steps)} steps in {spent_s:.1f} s",
+            f"hand lifted by {max(heights_mm) - heights_mm[0]:.1f} mm; gripper from {first.width_mm:.1f} to {last.width_mm:.1f} mm",
+        ]
+
+
+@writes("left", "right", *ALSO)
+def grip(plan: GripPlan, policy: Decide, out: Path, *, steps: int, period_s: float = 0.0, progress: Progress = silent) -> Gripped:
+    """Run a policy, and write the records to ``out``: a session for each sensor, and all of them in further formats.
+
+    Raises
+    ------
+    TwinError
+        As ``run_gripper``. The records up to there stay.
+    """
+    kept, rig = KeptAlso(out, plan.also, plan.sensor), plan.build()
+    pipelines, found = {name: Pipeline(plan.sensor, plan.form) for name in rig.sources}, list[GripStep]()
+    with stage(progress, f"policy on {rig.gripper.name}") as report, kept:
+
+        def decide(step: GripStep) -> tuple[np.ndarray, float]:
+            found.append(step)
+            report(step.index, steps)
+            return policy(step)
+
+        try:
+            timeout_s = TWIN_FRAME_S if any(isinstance(source, TwinCamera) for source in rig.sources.values()) else FRAME_S
+            run_gripper(rig, pipelines, decide, steps=steps, out=out, period_s=period_s, timeout_s=timeout_s)
+        finally:
+            if len(found) > 1:  # a step is written after its move
+                kept.catch_up()
+    return Gripped(found, [out / name for name in (*rig.sources, *kept.formats)])

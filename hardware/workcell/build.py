@@ -167,19 +167,24 @@ def build_rig(
     """
     form = form or (Form.PROCESSED if sensor.recording else Form.RAW)
     placed = PlacedObject(obj, placement, Mounting.of(sensor, experiment))
-    device: Arm = open_arm(arm)
-    simulated = kind_of(arm) == "simulated"  # by its name: an arm of another package is guarded, whatever class it has
+    device = open_guarded_arm(arm, limits, at_once=at_once and camera == TWIN)
     kind, _, rest = camera.partition(":")
     world = others("worlds")[kind](rest, sensor, placed.mounting.T_tool_sensor) if kind in offered("worlds") else None
-    if isinstance(device, SimulatedArm) and camera == TWIN and at_once:
-        device = SimulatedArm(axes=device.axes, time_scale=np.inf, name=device.name)
-    if not simulated or limits is not None:
-        device = SafeArm(device, load_limits(limits or kind_of(arm)))
     twin = None
     if camera == TWIN or world is not None:
         preview = draw_window(sensor, form, plain_light)
         twin = TwinCamera(sensor, placed, device.state, form, seed=seed, preview=preview, on_demand=at_once, world=world)
     return Rig(open_camera(camera if twin is None else TWIN, sensor, form, twin=twin), device, placed, camera == TWIN)
+
+
+def open_guarded_arm(arm: str, limits: str | None, *, at_once: bool) -> Arm:
+    """An arm as for ``build_rig``, behind its limits unless it is simulated without any. ``at_once``: a simulated arm needs no time."""
+    device = open_arm(arm)
+    if isinstance(device, SimulatedArm) and at_once:
+        device = SimulatedArm(axes=device.axes, time_scale=np.inf, name=device.name)
+    if kind_of(arm) == "simulated" and limits is None:  # by its name: an arm of another package is guarded, whatever class it has
+        return device
+    return SafeArm(device, load_limits(limits or kind_of(arm)))
 
 
 def twin_camera(sensor: SensorSpec, placed: PlacedObject, pose: PoseSource, form: Form, *, fps: float, plain_light: bool) -> TwinCamera:

@@ -440,6 +440,11 @@ NUMBERS = {  # values of an option that are refused, by call; in groups of an op
         "--device": "tpu",
     },
 }
+NUMBERS["grasp {grasp_policy} --out {out}"] = {
+    "--gripper": "nonsense output:x,40,10 ros2:/topic,x mujoco:nowhere",
+    "--object-mm": "0 x nan",
+    "--arm": "nonsense",
+}
 SAMPLED_NUMBERS = ("--kind star", "--max-frames -1", "--hold nonsense", "--elements 7")
 
 
@@ -481,6 +486,7 @@ EVERY = (
         "demonstrate",
         "learn",
         "policy",
+        "grasp",
     ),
     *("study tac-vgnn", "train", "tune", "validate"),
 )
@@ -513,6 +519,7 @@ WRITE = {
     "demonstrate": f"demonstrate --task GentlePress {S} --episodes 1 --out {{there}}",
     "learn": f"learn --task SurfaceFollow {S} --minutes 0.02 --environments 2 --out {{there}}",
     "policy": "policy {policy} --object can --steps 1 --plain-light --out {there}",
+    "grasp": "grasp {grasp_policy} --out {there}",
     "surrogate": f"surrogate {S} --paths 10 --workers 1 --out {{there}}/mine.safetensors",
     "study objects": f"study objects {S} --count 2 --tests 1 --elements 6 --workers 1 --epochs 1 --out {{there}}",
     "study sim-to-real": f"study sim-to-real {S} --frames {{recording}} --num-labelled 12 --count 10 --epochs 1 --workers 1 "
@@ -578,6 +585,7 @@ OVERWRITTEN = {  # files of the user's own in --out that a command of the same n
     "demonstrate": ("tactip.json", "README.md"),
     "learn": ("policy.safetensors", "learning.csv"),
     "policy": ("measures.json", "trajectory.csv"),
+    "grasp": ("left", "lerobot"),
     "render": ("frame.png", "truth.json"),
     "realism": ("metrics.json", "index.html"),
     "robustness": ("frames.csv", "index.html"),
@@ -837,4 +845,18 @@ NO_HOME = {
     "TACTIP_CACHE": "/proc/nowhere/cache",
 }
 
-CATALOGUE = (*_tables(), *_pictures(), *_specifications(), *_numbers(), *_outputs(), *_damaged(), *_ends(), *OPTIONS)
+GRASP_POLICIES: dict[str, Maker] = {
+    "missing": lambda folder, good: folder / "nowhere.zip",
+    "a folder": _empty_folder,
+    "text": written("policy.zip", "no policy"),
+    "binary": written("policy.zip", bytes(range(256))),
+    "of another program": lambda folder, good: good.policy,
+    "cut": lambda folder, good: Path(written("policy.zip", good.grasp_policy.read_bytes()[:5000])(folder, good)),
+}
+
+
+def _policies() -> list[Entry]:
+    return [Entry("policies", what, "grasp {data} --out {out}", {"data": make}, (REFUSED,)) for what, make in GRASP_POLICIES.items()]
+
+
+CATALOGUE = (*_policies(), *_tables(), *_pictures(), *_specifications(), *_numbers(), *_outputs(), *_damaged(), *_ends(), *OPTIONS)

@@ -89,6 +89,18 @@ class Harmless:
         return Path(shutil.copy(POLICIES / "SurfaceFollow-mg400-331.safetensors", self.folder / "policy.safetensors"))
 
     @cached_property
+    def grasp_policy(self) -> Path:
+        """A policy of the gripper that was not trained, as stable-baselines3 writes it."""
+        import gymnasium
+        from stable_baselines3 import PPO
+
+        import training.environments  # noqa: F401
+
+        path = self.folder / "grasp.zip"
+        PPO("MultiInputPolicy", gymnasium.make("tactip/GraspLift-v0"), seed=0, device="cpu", n_steps=4, batch_size=4).save(path)
+        return path
+
+    @cached_property
     def frames(self) -> Path:
         """Four frames of it in a folder."""
         path = self.folder / "frames"

@@ -14,7 +14,7 @@ from scenes import load_servo
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "tests" / "helpers" / "example_parts"
-PARTS = 12  # that the package offers; one raises, and one has the name of another
+PARTS = 14  # that the package offers; one raises, and one has the name of another
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +49,10 @@ from scenes import load_servo
 plane, placement, how = twin.load_object("plane"), load_servo("surface").placement, twin.load_experiment("surface-2d")
 rig = build_rig(simulator.spec, plane, placement, how, camera="example:frames", arm="example:here", form=twin.Form.RAW)
 print("guard", type(rig.arm).__name__, rig.arm.name)
+from hardware.servo.grip import GripPlan
+from training.environments.grasp import load_grasp_policy
+plan = GripPlan(simulator.spec, gripper="example:there", left="example:frames", right="example:frames", arm="example:here")
+print("gripper", plan.build().gripper.name, load_grasp_policy("example-grip")({"tactile": np.zeros((2, 2, 331, 2))}))
 try: twin.open_arm("nobody:")
 except twin.errors.TwinError as error: print("arms", "example" in str(error))
 
@@ -70,6 +74,7 @@ def test_each_part_is_used_whatever_is_imported_first(first, installed, tmp_path
         "spiral 61 pins on a spiral 61",
         "camera (320, 320)",
         "guard SafeArm example arm at here",
+        "gripper example gripper at there [0.1]",
         "arms True",
         "model True",
         "task (1,)",

@@ -82,7 +82,7 @@ def test_lerobot_reads_its_own_format(written, lerobot, tmp_path):
     found = read_with(lerobot, LEROBOT, written("lerobot"), tmp_path=tmp_path)
     assert (found["frames"], found["episodes"], found["fps"], found["tasks"]) == (len(STEPS), 3, 10, TASKS)
     assert found["levels"] == [3.0 * step.image.sum() for step in STEPS]
-    for name, channel in CHANNELS.items():
+    for name, channel in ((name, CHANNELS[name]) for name in ABOUT.numbers):
         read = found["action"] if name == "action" else found["numbers"][channel.column]
         np.testing.assert_array_equal(np.array(read, float), [step.values[name].ravel() for step in STEPS])
     np.testing.assert_allclose(np.ravel(found["numbers"][TIME]), [step.time_s for step in STEPS], atol=1e-6)  # PyTorch's 32 bits
@@ -114,7 +114,7 @@ def test_datasets_reads_the_pictures_with_their_metadata(written, lerobot, tmp_p
         rows.sort(key=lambda row: (row["episode_index"], row["frame_index"]))
         assert [row["image"] for row in rows] == [int(step.image.sum()) for step in STEPS]
         assert [row["task"] for row in rows] == TASKS
-        for name, channel in CHANNELS.items():
+        for name, channel in ((name, CHANNELS[name]) for name in ABOUT.numbers):
             np.testing.assert_array_equal(np.array([row[channel.column] for row in rows], float), [step.values[name] for step in STEPS])
 
 

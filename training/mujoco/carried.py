@@ -21,6 +21,8 @@ from twin.rig.arm_pose import matrix_of
 from twin.types import PinState
 
 CARRIED = "carried_tactip"
+OPEN_MM = 44.0
+"""Width of a scene's gripper at the start."""
 LONGEST_S = 0.2
 """Most time that passes in the scene between two poses. If the arm needs more, the objects stand still for the rest of it."""
 
@@ -97,7 +99,7 @@ class SceneGripper:
     scene : TactileScene
     """
 
-    def __init__(self, scene: str, sensor: SensorSpec, *, width_mm: float) -> None:
+    def __init__(self, scene: str, sensor: SensorSpec, *, width_mm: float = OPEN_MM) -> None:
         spec, sensors = load_scene(scene, sensor)
         self.name, self.scene = f"gripper of {scene}", TactileScene(spec.compile(), sensors)
         self._lock, self._from_mm, self._last_s = threading.Lock(), np.nan, np.nan

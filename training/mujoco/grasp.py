@@ -10,25 +10,18 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from training.environments.grasp import STEPS, TOUCHING_MM, GraspHand
 from training.mujoco.geoms import MM
-from training.mujoco.task import PERIOD_S, GripperTask
+from training.mujoco.task import GripperTask
 from twin.errors import OptionError
 from twin.types import FloatArray
 
-GRIP_S, LIFT_S, HOLD_S, LOWER_S = 0.5, 2.5, 2.0, 1.0
-STEPS = round((GRIP_S + LIFT_S + HOLD_S + LOWER_S) / PERIOD_S)
-"""Number of decisions of an episode."""
-LIFT_MM = 50.0
 MASS_KG, FRICTION = (0.05, 0.3), (0.3, 0.8)
 """Ranges of mass and friction."""
 LEAST_N = 0.32, 2.0
 """Range of the least grip. The skin is too soft for more."""
 CRUSH, WANTED = 2.0, 1.4
 """Multiples of the least grip: at which the object breaks, and which earns most."""
-GRIP_MM = 0.3
-"""Motion of each finger by an action of 1."""
-TOUCHING_MM, MOST_CLOSED_MM = 19.0, 26.0
-"""Travel of each finger at the start, and its largest travel."""
 FALLEN_MM = 12.0
 """Distance by which the object may sink in the grip. The skin alone gives way by up to 6 mm."""
 STANDS_MM = 1.0
@@ -60,7 +53,7 @@ class GraspLift(GripperTask):
         model, data = self._model, self.scene.data
         model.body_mass[self._object], model.body_inertia[self._object] = mass, mass * self._inertia
         model.geom_friction[self._geom, 0] = friction
-        self._fingers, self.hand_mm, self._done = TOUCHING_MM, 0.0, 0
+        self._hand = GraspHand()
         self.begin(TOUCHING_MM)
         mujoco.mj_forward(model, data)
         self.scene.reset()
@@ -70,16 +63,11 @@ class GraspLift(GripperTask):
 
     def step(self, action: FloatArray) -> tuple[dict[str, FloatArray], float, bool, bool, dict[str, Any]]:
         """Move fingers and hand; see gymnasium. The reward of a step is at most 1, and 0 where the episode fails."""
-        closing = self.as_action(action)[0]
-        self._done += 1
-        self._fingers = float(np.clip(self._fingers + GRIP_MM * closing, 0.0, MOST_CLOSED_MM))
-        lifted = GRIP_S, GRIP_S + LIFT_S, GRIP_S + LIFT_S + HOLD_S, STEPS * PERIOD_S
-        share = float(np.interp(self._done * PERIOD_S, lifted, [0.0, 1.0, 1.0, 0.0]))
-        self.hand_mm = LIFT_MM * (1 - float(np.cos(np.pi * share))) / 2
-        self.settle(targets=(self.hand_mm / MM, self._fingers / MM))
+        self._hand.move(self.as_action(action)[0])
+        self.settle(targets=(self._hand.hand_mm / MM, self._hand.fingers_mm / MM))
         seen, grip_n, height = self._look(), self.grip_n(), self.height_mm()
-        crushed, dropped = grip_n > CRUSH * self.least_n, self.hand_mm - height > FALLEN_MM
-        over, failed = self._done == STEPS, crushed or dropped
+        crushed, dropped = grip_n > CRUSH * self.least_n, self._hand.hand_mm - height > FALLEN_MM
+        over, failed = self._hand.done == STEPS, crushed or dropped
         solved = over and not failed and height < STANDS_MM
         ratio = max(grip_n, 1e-3) / (WANTED * self.least_n)
         terms = {"grip": 0.0 if failed else min(ratio, 1 / ratio), "set_down": BONUS * solved}
@@ -95,4 +83,4 @@ class GraspLift(GripperTask):
         return float(min(each.force_n[2] for each in self.felt))
 
     def _look(self) -> dict[str, FloatArray]:
-        return self.look([(self._fingers - TOUCHING_MM) / 5.0, self.hand_mm / LIFT_MM, self._done / STEPS])
+        return self.look(self._hand.state())

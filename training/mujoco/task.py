@@ -9,15 +9,12 @@ import numpy as np
 from gymnasium import spaces
 
 from scenes import load_sensor
+from training.environments.grasp import PERIOD_S, as_observation, in_spacings, with_change
 from training.mujoco.model import load_scene
 from training.mujoco.scene import TactileScene
 from twin.errors import OptionError
 from twin.types import FloatArray, ImageArray
 
-PERIOD_S = 0.05
-"""Time between two decisions."""
-CHANGES = 10.0
-"""Factor by which changes of touch are observed."""
 Touch = Literal["pins", "wrench", "none"]
 TOUCHES: tuple[str, ...] = get_args(Touch)
 
@@ -68,7 +65,6 @@ class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
         self._object = int(self._model.geom_bodyid[self._geom])
         self._inertia = self._model.body_inertia[self._object] / self._model.body_mass[self._object]
         self.rest_px = [self.scene.read(site).pins_px for site in sensors]
-        self._spacing = float(np.median(np.linalg.norm(np.diff(self.rest_px[0], axis=0), axis=1)))
         self._renderer: mujoco.Renderer | None = None
         shapes = {"pins": (2, 2, *self.rest_px[0].shape), "wrench": (2, 2, 6)}
         box: dict[str, spaces.Space[Any]] = {"state": spaces.Box(-10.0, 10.0, self.shape[:1], np.float32)}
@@ -106,18 +102,15 @@ class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
             self.scene.step()
         self.felt = [self.scene.read(site) for site in self.scene.sensors]
         if self.observation == "pins":
-            touch = np.stack([of.pins_px - rest for of, rest in zip(self.felt, self.rest_px, strict=True)]) / self._spacing
+            touch = in_spacings([of.pins_px for of in self.felt], self.rest_px)
         else:
             touch = np.stack([np.concatenate([of.force_n, of.torque_nmm / 10.0]) for of in self.felt])
-        before = touch if self._touch is None else self._touch[0]
-        self._touch = np.stack([touch, CHANGES * (touch - before)])
+        self._touch = with_change(touch, self._touch)
 
     def look(self, state: list[float]) -> dict[str, FloatArray]:
         """The observation: ``state`` and touch."""
-        seen: dict[str, FloatArray] = {"state": np.array(state)}
-        if self.observation != "none" and self._touch is not None:
-            seen["tactile"] = self._touch
-        return {name: np.clip(values, -10.0, 10.0).astype(np.float32) for name, values in seen.items()}
+        touch = {} if self.observation == "none" or self._touch is None else {"tactile": self._touch}
+        return as_observation(state=state, **touch)
 
     def render(self) -> ImageArray | None:
         """The scene, (480, 640, 3) uint8, if the render mode is ``rgb_array``; else None."""

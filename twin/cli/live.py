@@ -4,6 +4,7 @@
 - ``twin collect``: labelled frames from a camera and an arm.
 - ``twin servo``: follow an object's outline.
 - ``twin policy``: a trained policy on a camera and an arm.
+- ``twin grasp``: a trained policy on two sensors of a gripper.
 - ``twin emulate``: arms, and the sensor's camera, emulated on this machine for any client.
 """
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from hardware.emulators.faults import Fault
     from hardware.live.live import WatchResult
     from hardware.servo.following import Followed
+    from hardware.servo.grip import Gripped
 
 # Sensor whose trained weights are shipped with the package.
 SHIPPED_MODEL = Path("mg400-331")
@@ -276,6 +278,52 @@ def run_policy(
     with signals_as_ctrl_c():
         followed = follow(plan, load_for_outlines(policy, contacts_of), out, about={"policy": str(policy)}, progress=progress)
     return followed  # type: ignore[return-value]  # a dry run has nothing but its lines
+
+
+@app.command("grasp")
+def grasp(
+    policy: Annotated[str, typer.Argument(help="ZIP file of stable-baselines3 (PPO), or the name of a package's policy")],
+    out: options.Out,
+    sensor: options.Sensor = str(SHIPPED_MODEL),
+    gripper: Annotated[
+        str, typer.Option("--gripper", metavar="G", help="mujoco:SCENE, output:N,OPEN_MM,CLOSED_MM (of an MG400), ros2:TOPIC[,JOINTS]")
+    ] = "mujoco:gripper",
+    left: Annotated[str, typer.Option(metavar="C", help="camera of the left sensor, as --camera of 'twin policy'")] = "",
+    right: Annotated[str, typer.Option(metavar="C", help="camera of the right sensor")] = "",
+    arm: ArmOption = "simulated",
+    object_mm: Annotated[float, typer.Option(min=1, max=200, help="width of the object between the fingers")] = 40.0,
+    safety: Limits = None,
+    also: options.Also = None,
+    *,
+    progress: Progress,
+) -> "Gripped":
+    """Run a policy of GraspLift on two sensors of a gripper.
+
+    The policy of 'tactip/GraspLift-v0' with the observation 'pins' gets the pins of both sensors from the live pipeline, and commands the
+    fingers. The arm lifts the object by 50 mm, holds it and sets it down in 6 s, as in the environment. First the gripper opens, and the
+    pins at rest are taken; then it closes on the object. By default all of this runs in a MuJoCo scene, with rasterised frames of both
+    sensors. With --gripper, --left, --right and --arm the same loop runs on devices.
+
+    A ZIP file of stable-baselines3 can contain code, which is run: give only one that you trust. At the end the arm is disabled, and the
+    gripper keeps its width.
+
+    \b
+    Example:
+      twin grasp policy.zip --out out/grasp --also lerobot
+      twin grasp policy.zip --gripper output:3,44,30 --arm mg400 \\
+          --left /dev/video0 --right /dev/video2 --out out/live
+
+    \b
+    Writes to --out:
+      left/, right/  a session for each sensor, with the same steps
+      lerobot/, ...  with --also: both in one record
+    """
+    from hardware.servo.grip import GripPlan, grip
+    from training.environments.grasp import PERIOD_S, GraspPolicy, load_grasp_policy
+
+    plan, decide = call(GripPlan, locals()), GraspPolicy(load_grasp_policy(policy), object_mm)
+    with signals_as_ctrl_c():
+        return grip(plan, decide, out, steps=decide.steps, period_s=PERIOD_S, progress=progress)
 
 
 emulate = App(

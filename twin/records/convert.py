@@ -18,10 +18,10 @@ from twin.progress import Progress, silent, stage
 from twin.records.folder import HELD_STEPS, SIDECAR, FolderWriter, format_of
 from twin.records.huggingface import HuggingFaceWriter, huggingface_records
 from twin.records.lerobot import DATA_MB, INFO, LeRobotWriter, lerobot_records
-from twin.records.record import About, Episode, RecordError, Records, RecordStep
+from twin.records.record import About, Episode, RecordError, Records, RecordStep, is_pins
 from twin.records.recording import RecordingWriter, recording_records
 from twin.records.ros2 import Ros2Writer, ros2_records
-from twin.records.session import is_session, session_records
+from twin.records.session import is_session, rig_records, session_records
 from twin.store import writes
 from twin.types import Frame, ReadableResult
 
@@ -64,6 +64,8 @@ def open_records(path: str | Path) -> Records:
             return READERS[name](path)
         if (path / INFO).is_file():
             return lerobot_records(path)
+        if (records := rig_records(path)) is not None:
+            return records
     return recording_records(path)
 
 
@@ -80,7 +82,7 @@ def with_pins(records: Records, spec: SensorSpec | None = None) -> Records:
     FrameError
         The pictures, or the pins that the records have, are not of this sensor.
     """
-    if "pins" in records.about.numbers:
+    if any(map(is_pins, records.about.numbers)):
         if spec is not None:
             _require_pins_of(spec, records.about)
         return records
@@ -103,7 +105,7 @@ def with_pins(records: Records, spec: SensorSpec | None = None) -> Records:
 
 def _require_pins_of(spec: SensorSpec, about: About) -> None:
     """Refuse a sensor if the pins of a record are those of another one, by its name or by their number."""
-    count = about.numbers["pins"] // 2
+    count = next(count for name, count in about.numbers.items() if is_pins(name)) // 2
     name = Path(about.sensor).stem
     if name in ("", spec.name) and count == spec.pins.count:
         return
@@ -143,6 +145,8 @@ def open_writer(folder: Path, to: str, about: About, rate_hz: int, *, video: boo
         raise RecordError(f"no format {quote(to)}; there are {', '.join(FORMATS)}")
     if video and to != LeRobotWriter.FORMAT:
         raise RecordError(f"`video` is an option of the format {LeRobotWriter.FORMAT}; {to} stores pictures without loss; leave it out")
+    if len(about.views) > 1 and to not in (LeRobotWriter.FORMAT, Ros2Writer.FORMAT):
+        raise RecordError(f"{to} has one picture in a step, this record has {len(about.views)}; give lerobot or mcap, or one session of it")
     if to == LeRobotWriter.FORMAT:
         return LeRobotWriter(folder, about, rate_hz, video=video, held_mb=0.0 if at_once else DATA_MB)
     if to == Ros2Writer.FORMAT:

@@ -137,9 +137,10 @@ class FolderWriter(ABC):
         """Raise ``RecordError`` if a step does not agree with ``about``, or its time is not a valid number."""
         if not 0.0 <= step.time_s < float("inf"):
             raise RecordError(f"{episode.key}: a picture has the time {step.time_s} s after the first; correct the times, or record again")
-        height, width = step.image.shape[:2]
-        if (width, height) != self.about.size_px or (step.image.ndim == 2) != self.about.gray:
-            raise RecordError(f"{episode.key}: a picture of {step.image.shape}, the others have {self.about.size_px}; record it separately")
+        for image in step.images:
+            height, width = image.shape[:2]
+            if (width, height) != self.about.size_px or (image.ndim == 2) != self.about.gray:
+                raise RecordError(f"{episode.key}: a picture of {image.shape}, the others have {self.about.size_px}; record it separately")
         for name in self.about.numbers:
             if (got := np.shape(step.values.get(name, ()))) != self.about.shape(name):
                 raise RecordError(f"{episode.key}: {name} of shape {got}, expected {self.about.shape(name)}; record it separately")

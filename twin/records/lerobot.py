@@ -23,7 +23,7 @@ from twin.frames import open_recording
 from twin.frames.lerobot import COUNTERS
 from twin.frames.videos import describe_pauses
 from twin.records.folder import AGAIN, FolderWriter, image_of, png, read_json, read_sidecar, reading_tables, records_in
-from twin.records.record import CHANNELS, IMAGE, TIME, About, Episode, RecordError, Records, RecordStep, off_s
+from twin.records.record import TIME, About, Episode, RecordError, Records, RecordStep, channel_of, image_column, off_s
 from twin.store import write_json, write_text, write_with
 from twin.types import Form
 
@@ -72,6 +72,7 @@ class LeRobotWriter(FolderWriter):
     def __init__(self, folder: Path, about: About, rate_hz: int, *, video: bool = False, held_mb: float = DATA_MB) -> None:
         super().__init__(folder, about, rate_hz)
         self.video, self.held_bytes = video, held_mb * 1e6
+        self._images = [image_column(view) for view in about.views]
         self._file = self._frames = 0  # number of the next file, and number of frames so far
         self._tasks: list[str] = []
         self._off: list[tuple[float, str, str]] = []  # largest error of a time (s), key and pauses of an episode
@@ -92,7 +93,8 @@ class LeRobotWriter(FolderWriter):
             self._tasks = _tasks(self.folder)
             stats = read_json(self.folder / STATS)
             self._stats = {key: {k: np.asarray(v, float) for k, v in each.items()} for key, each in stats.items()}
-        for pattern in (DATA_PATH, EPISODES_PATH, VIDEO_PATH.replace("{video_key}", IMAGE)):  # files of a run that was killed
+        videos = [VIDEO_PATH.replace("{video_key}", image) for image in self._images]
+        for pattern in (DATA_PATH, EPISODES_PATH, *videos):  # files of a run that was killed
             for path in self.folder.glob(pattern.partition("/chunk")[0] + "/chunk-*/file-*"):
                 chunk, file = (int(part.split("-")[1].split(".")[0]) for part in path.parts[-2:])
                 if chunk * CHUNK_FILES + file >= self._file:
@@ -110,15 +112,15 @@ class LeRobotWriter(FolderWriter):
         at = {"chunk_index": self._file // CHUNK_FILES, "file_index": self._file % CHUNK_FILES}
         path = _make_folder(self.folder / DATA_PATH.format(**at))
         with tempfile.TemporaryDirectory(prefix="twin-video-") as aside:
-            video = Path(aside) / "episodes.mp4"
-            write_with(path, partial(self._fill, waiting=waiting, group=group, at=at, video=video))
+            films = {image: Path(aside) / f"{image}.mp4" for image in self._images} if self.video else {}
+            write_with(path, partial(self._fill, waiting=waiting, group=group, at=at, films=films))
             if not group:
                 path.unlink()
                 return []
-            if self.video:
-                into = _make_folder(self.folder / VIDEO_PATH.format(video_key=IMAGE, **at))
-                with video.open("rb") as made:
-                    write_with(into, lambda file: shutil.copyfileobj(made, file))
+            for image, film in films.items():
+                into = _make_folder(self.folder / VIDEO_PATH.format(video_key=image, **at))
+                with film.open("rb") as made:
+                    write_with(into, partial(shutil.copyfileobj, made))
         stats = self._stats
         for _, _, each in group:
             stats = _together(stats, each)
@@ -127,12 +129,12 @@ class LeRobotWriter(FolderWriter):
         self._frames += sum(row["length"] for row, _, _ in group)
         return [facts for _, facts, _ in group]
 
-    def _fill(self, file: BinaryIO, *, waiting: Iterator[Episode], group: list, at: dict[str, int], video: Path) -> None:
+    def _fill(self, file: BinaryIO, *, waiting: Iterator[Episode], group: list, at: dict[str, int], films: dict[str, Path]) -> None:
         """Write episodes into an open data file until it is large enough."""
         parquet, pa = library("pyarrow.parquet"), library("pyarrow")
         schema = self._schema(pa)
         frames, written = self._frames, 0
-        film = _open_film(video, self.rate_hz, self.about.size_px) if self.video else None
+        opened = [_open_film(path, self.rate_hz, self.about.size_px) for path in films.values()]
         with parquet.ParquetWriter(file, schema, compression="snappy", write_page_checksum=True) as table:
             for episode in waiting:
                 number, rows, length = len(self.facts) + len(group), [], 0
@@ -144,10 +146,11 @@ class LeRobotWriter(FolderWriter):
                     self._require_fitting(episode, step)
                     gathered.add(step, length)
                     row = self._row(step, length, number, frames + length, task)
-                    if film is not None:
-                        film.write(np.ascontiguousarray(_colour(step.image)[..., ::-1]))
+                    for film, image in zip(opened, step.images, strict=False):
+                        film.write(np.ascontiguousarray(_colour(image)[..., ::-1]))
                     rows.append(row)
-                    written += len(row[IMAGE]["bytes"]) if IMAGE in row else 4 * sum(self.about.numbers.values())
+                    pictures = [row[image] for image in self._images if image in row]
+                    written += sum(len(each["bytes"]) for each in pictures) or 4 * sum(self.about.numbers.values())
                     length += 1
                     if len(rows) == ROWS:
                         table.write_table(pa.Table.from_pylist(rows, schema))
@@ -163,7 +166,7 @@ class LeRobotWriter(FolderWriter):
                 frames += length
                 if written >= self.held_bytes:
                     break
-        if film is not None:
+        for film in opened:
             film.release()
 
     def notes(self) -> list[str]:
@@ -181,10 +184,12 @@ class LeRobotWriter(FolderWriter):
             self._off.append((most_s, key, describe_pauses(times_s)))
 
     def _row(self, step: RecordStep, number: int, episode: int, index: int, task: int) -> dict[str, Any]:
-        row: dict[str, Any] = {} if self.video else {IMAGE: {"bytes": png(_colour(step.image)), "path": f"frame-{number:06d}.png"}}
+        row: dict[str, Any] = {}
+        for column, image in () if self.video else zip(self._images, step.images, strict=True):
+            row[column] = {"bytes": png(_colour(image)), "path": f"frame-{number:06d}.png"}
         for name, count in self.about.numbers.items():  # a single number is no list
             values = np.asarray(step.values[name], np.float32)
-            row[CHANNELS[name].column] = values.tolist() if count > 1 else values.item()
+            row[channel_of(name).column] = values.tolist() if count > 1 else values.item()
         counted = dict(zip(COUNTERS, (number, episode, index, task), strict=True))
         return row | {TIME: float(step.time_s), "timestamp": number / self.rate_hz} | counted
 
@@ -216,10 +221,10 @@ class LeRobotWriter(FolderWriter):
         if self.video:
             said = {"video.height": height, "video.width": width, "video.codec": "mpeg4", "video.pix_fmt": "yuv420p", "video.channels": 3}
             image |= {"dtype": "video", "info": said | {"video.fps": self.rate_hz, "video.is_depth_map": False, "has_audio": False}}
-        features = {IMAGE: image}
+        features = dict.fromkeys(self._images, image)
         for name in self.about.numbers:
             shape, names = list(self.about.shape(name)), list(self.about.axes(name))
-            features[CHANNELS[name].column] = {"dtype": "float32", "shape": shape, "names": names if len(shape) == 1 else ["pin", "axis"]}
+            features[channel_of(name).column] = {"dtype": "float32", "shape": shape, "names": names if len(shape) == 1 else ["pin", "axis"]}
         features[TIME] = {"dtype": "float64", "shape": [1], "names": None}
         features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
         return features | {name: {"dtype": "int64", "shape": [1], "names": None} for name in COUNTERS}
@@ -232,12 +237,12 @@ class LeRobotWriter(FolderWriter):
             "dataset_from_index": start,
             "dataset_to_index": start + length,
         }
-        for what in ("data", "meta/episodes", *([f"videos/{IMAGE}"] if self.video else [])):
+        for what in ("data", "meta/episodes", *(f"videos/{image}" for image in self._images if self.video)):
             row |= {f"{what}/{key}": value for key, value in at.items()}
         if self.video:
             before = start - self._frames  # frames of this file before it
             ends_s = {"from": before / self.rate_hz, "to": (before + length) / self.rate_hz}
-            row |= {f"videos/{IMAGE}/{end}_timestamp": time_s for end, time_s in ends_s.items()}
+            row |= {f"videos/{image}/{end}_timestamp": time_s for image in self._images for end, time_s in ends_s.items()}
         return row
 
     def _write_meta(self, group: list, at: dict[str, int], stats: Stats) -> None:
@@ -285,7 +290,8 @@ class _Gathered:
     def __init__(self, about: About) -> None:
         self._values: dict[str, list[np.ndarray]] = {name: [] for name in about.numbers}
         self.times_s: list[float] = []
-        self._pictures: list[np.ndarray] = []
+        self._images = [image_column(view) for view in about.views]
+        self._pictures: list[list[np.ndarray]] = []  # of each kept step
         self._every = 1
 
     def add(self, step: RecordStep, number: int) -> None:
@@ -294,23 +300,25 @@ class _Gathered:
             values.append(np.asarray(step.values[name], np.float32))
         self.times_s.append(step.time_s)
         if number % self._every == 0:
-            self._pictures.append(_colour(step.image)[::PIXEL_STEP, ::PIXEL_STEP])
+            self._pictures.append([_colour(image)[::PIXEL_STEP, ::PIXEL_STEP] for image in step.images])
         if len(self._pictures) > 2 * SAMPLED:
             self._pictures, self._every = self._pictures[::2], 2 * self._every
 
     def stats(self, rate_hz: int, number: int, start: int, task: int) -> Stats:
         """Statistics of each column, in LeRobot's shapes: (3, 1, 1) for pictures, with values from 0 to 1, and (2,) for pins."""
         length = len(self.times_s)
-        pixels = np.stack(self._pictures).reshape(-1, 3) / 255.0
-        found = {IMAGE: {key: value.reshape(-1, 1, 1) for key, value in _deviations(pixels).items()}}
+        found = {}
+        for column, pictures in zip(self._images, zip(*self._pictures, strict=True), strict=True):
+            pixels = np.stack(pictures).reshape(-1, 3) / 255.0
+            found[column] = {key: value.reshape(-1, 1, 1) for key, value in _deviations(pixels).items()}
         for name, values in self._values.items():
             stacked = np.stack(values).astype(float)
-            found[CHANNELS[name].column] = _deviations(stacked.reshape(-1, stacked.shape[-1]))
+            found[channel_of(name).column] = _deviations(stacked.reshape(-1, stacked.shape[-1]))
         frames = np.arange(length)
         counters = (frames, np.full(length, number), start + frames, np.full(length, task))
         plain = {TIME: np.array(self.times_s), "timestamp": frames / rate_hz} | dict(zip(COUNTERS, counters, strict=True))
         found |= {name: _deviations(np.asarray(values, float)[:, None]) for name, values in plain.items()}
-        return {name: each | {"count": np.array([len(self._pictures) if name == IMAGE else length])} for name, each in found.items()}
+        return {name: each | {"count": np.array([len(self._pictures) if name in self._images else length])} for name, each in found.items()}
 
 
 def _deviations(rows: np.ndarray) -> dict[str, np.ndarray]:
@@ -373,8 +381,8 @@ def lerobot_records(folder: Path) -> Records:
 
 def _steps_of(folder: Path, row: dict[str, Any], about: About) -> Iterator[RecordStep]:
     path, number = folder / DATA_PATH.format(**{key: row[f"data/{key}"] for key in ("chunk_index", "file_index")}), row["episode_index"]
-    video = f"videos/{IMAGE}/from_timestamp" in row
-    pictures = _film_pictures(folder, row, about) if video else iter(())
+    columns = [image_column(view) for view in about.views]
+    films = [_film_pictures(folder, row, about, column) for column in columns if f"videos/{column}/from_timestamp" in row]
     with reading_tables(path) as parquet:
         file = parquet.ParquetFile(path, page_checksum_verification=True)
         leaf = next(k for k in range(len(file.schema)) if file.schema.column(k).path == "episode_index")
@@ -384,18 +392,19 @@ def _steps_of(folder: Path, row: dict[str, Any], about: About) -> Iterator[Recor
                 continue
             for line in file.read_row_group(group).to_pylist():
                 if line["episode_index"] == number:
-                    image = next(pictures) if video else image_of(line[IMAGE]["bytes"], about.gray, str(path))
-                    found = {name: np.asarray(line[CHANNELS[name].column], np.float32) for name in about.numbers}
-                    yield RecordStep(image, float(line[TIME]), {name: value.reshape(about.shape(name)) for name, value in found.items()})
+                    images = [next(film) for film in films] or [image_of(line[each]["bytes"], about.gray, str(path)) for each in columns]
+                    found = {name: np.asarray(line[channel_of(name).column], np.float32) for name in about.numbers}
+                    values = {name: value.reshape(about.shape(name)) for name, value in found.items()}
+                    yield RecordStep(images[0], float(line[TIME]), values, tuple(images[1:]))
 
 
-def _film_pictures(folder: Path, row: dict[str, Any], about: About) -> Iterator[np.ndarray]:
+def _film_pictures(folder: Path, row: dict[str, Any], about: About, column: str) -> Iterator[np.ndarray]:
     """An episode's pictures from its video."""
-    at = {key: row[f"videos/{IMAGE}/{key}"] for key in ("chunk_index", "file_index")}
+    at = {key: row[f"videos/{column}/{key}"] for key in ("chunk_index", "file_index")}
     rate_hz = int(read_json(folder / INFO)["fps"])
-    first = round(row[f"videos/{IMAGE}/from_timestamp"] * rate_hz)
+    first = round(row[f"videos/{column}/from_timestamp"] * rate_hz)
     with ErrorsAs(FrameError, lambda error: RecordError(f"{folder}: {error}")):
-        for k, frame in enumerate(open_recording(folder / VIDEO_PATH.format(video_key=IMAGE, **at), None, Form.RAW)):
+        for k, frame in enumerate(open_recording(folder / VIDEO_PATH.format(video_key=column, **at), None, Form.RAW)):
             if first <= k < first + row["length"]:
                 yield frame.image[..., 0] if about.gray and frame.image.ndim == 3 else frame.image
 
@@ -447,5 +456,5 @@ def _card(about: About) -> str:
     """The data set's page."""
     files = "configs:\n- config_name: default\n  data_files: data/*/*.parquet\n"
     head = f"---\ntask_categories:\n- robotics\ntags:\n- LeRobot\n- tactile\n{files}---\n\n"
-    lines = [f"- `{CHANNELS[name].column}`: {CHANNELS[name].meaning}" for name in about.numbers]
+    lines = [f"- `{channel_of(name).column}`: {channel_of(name).meaning}" for name in about.numbers]
     return head + f"# Records of the tactile sensor {about.sensor}\n\nA LeRobotDataset of version 3.\n\n" + "\n".join(lines) + "\n"

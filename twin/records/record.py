@@ -74,6 +74,7 @@ CHANNELS = {
         Channel("estimate", "observation.tactile.estimate", "/tactip/estimate", (), "the model's estimate, mm and deg; NaN: not valid"),
         Channel("low", "observation.tactile.estimate_low", "/tactip/estimate_low", (), "lower end of its 90 % interval"),
         Channel("high", "observation.tactile.estimate_high", "/tactip/estimate_high", (), "upper end of its 90 % interval"),
+        Channel("width", "observation.gripper_width", "/tactip/gripper_width", ("mm",), "the gripper's width, mm"),
         Channel("goal", "observation.environment_state", "/tactip/goal", (), "the goal of the task"),
         Channel(
             "action", "action", "/tactip/command", POSE_AXES, "the pose that the arm was sent to, mm and deg; or as the record names it"
@@ -83,7 +84,29 @@ CHANNELS = {
 """All channels, in the order in which formats have them."""
 IMAGE, TIME = "observation.images.tactip", "observation.time_s"
 """Columns of the picture and of the time of its exposure (s, from the episode's first exposure)."""
+ONE_VIEW = (IMAGE.rpartition(".")[2],)
+"""Name of the only sensor of a record: the last part of the picture's column."""
 _ESTIMATED = ("estimate", "low", "high")
+
+
+def channel_of(name: str) -> Channel:
+    """The channel of a name in ``About.numbers``. ``pins.left`` are the pins of the sensor ``left`` in a record of several sensors."""
+    kind, _, view = name.partition(".")
+    own = CHANNELS[kind]
+    if not view:
+        return own
+    column, topic = own.column.replace("tactile", f"tactile.{view}"), own.topic.replace(ONE_VIEW[0], view)
+    return replace(own, name=name, column=column, topic=topic)
+
+
+def is_pins(name: str) -> bool:
+    """Whether a channel's numbers are a sensor's pins."""
+    return name.partition(".")[0] == "pins"
+
+
+def image_column(view: str) -> str:
+    """The column of a sensor's picture."""
+    return IMAGE.replace(ONE_VIEW[0], view)
 
 
 @dataclass(frozen=True)
@@ -109,6 +132,8 @@ class About:
         Kind of the arm, or a specification such as ``mg400:192.168.1.6``, of which only the kind is kept; "" if unknown.
     names : dict of str to tuple of str
         Names of the numbers of channels that are not the usual ones: of goals, and of actions that are no poses.
+    views : tuple of str
+        Names of the sensors whose pictures a step has.
     """
 
     sensor: str
@@ -120,29 +145,30 @@ class About:
     frame: str = "work"
     robot: str = ""
     names: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    views: tuple[str, ...] = ONE_VIEW
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "robot", self.robot.partition(":")[0].removesuffix("-lenient"))
 
     def axes(self, channel: str) -> tuple[str, ...]:
         """Names of the numbers of a channel. Pins have ``pin_0_x, pin_0_y, pin_1_x, ...``."""
-        if channel == "pins":
-            return tuple(f"pin_{k}_{axis}" for k in range(self.numbers["pins"] // 2) for axis in "xy")
+        if is_pins(channel):
+            return tuple(f"pin_{k}_{axis}" for k in range(self.numbers[channel] // 2) for axis in "xy")
         return self.names.get(channel, self.estimates if channel in _ESTIMATED else CHANNELS[channel].axes)
 
     def is_plain(self, channel: str) -> bool:
         """Whether a channel's numbers are no pose and no wrench."""
-        return channel in self.names or not CHANNELS[channel].axes
+        return self.axes(channel) not in (POSE_AXES, WRENCH_AXES)
 
     def shape(self, channel: str) -> tuple[int, ...]:
         """Shape of a channel's array in one step."""
         count = self.numbers[channel]
-        return (count // 2, 2) if channel == "pins" else (count,)
+        return (count // 2, 2) if is_pins(channel) else (count,)
 
     def plain(self) -> dict[str, Any]:
         """The properties as JSON."""
         return TypeAdapter(About).dump_python(self, mode="json", warnings=False) | {
-            "channels": {name: CHANNELS[name].meaning for name in self.numbers}
+            "channels": {name: channel_of(name).meaning for name in self.numbers}
         }
 
     @classmethod
@@ -155,9 +181,10 @@ class About:
             A property is missing or wrong.
         """
         about = TypeAdapter(About).validate_python(plain)
-        if not set(about.numbers) <= CHANNELS.keys() or not all(0 < count < 1_000_000 for count in about.numbers.values()):
+        known = {*CHANNELS, *(f"pins.{view}" for view in about.views)}
+        if not set(about.numbers) <= known or not about.views or not all(0 < count < 1_000_000 for count in about.numbers.values()):
             raise ValueError("unknown channels")
-        return replace(about, numbers={name: about.numbers[name] for name in CHANNELS if name in about.numbers})
+        return about
 
     def differs(self, other: "About") -> list[str]:
         """Reasons why episodes of another record do not fit into this one."""
@@ -178,11 +205,19 @@ class RecordStep:
         Time of the exposure, s, from the episode's first exposure. A step that uses the frame of the step before it is later.
     values : dict of str to array of float32
         The numbers of each channel; shapes as ``About.shape``.
+    beside : tuple of array
+        The pictures of further sensors.
     """
 
     image: ImageArray
     time_s: float
     values: Mapping[str, np.ndarray]
+    beside: tuple[ImageArray, ...] = ()
+
+    @property
+    def images(self) -> tuple[ImageArray, ...]:
+        """The pictures of all sensors."""
+        return (self.image, *self.beside)
 
 
 @dataclass(frozen=True)

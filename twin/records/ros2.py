@@ -17,12 +17,12 @@ import numpy as np
 from twin.errors import library
 from twin.records import ros2_messages as ros
 from twin.records.folder import AGAIN, VERSION, FolderWriter, image_of, png, read_sidecar, require_numbered, whole_steps
-from twin.records.record import CHANNELS, About, Episode, RecordError, Records, RecordStep, float32
+from twin.records.record import About, Episode, RecordError, Records, RecordStep, channel_of, float32, is_pins
 from twin.rig.arm_pose import matrix_of
 from twin.store import write_with
 
-IMAGE_TOPIC, CONTACT_TOPIC, POSE_TOPIC = "/tactip/image/compressed", "/tactip/contact", "/tactip/pose"
-TOOL_FRAME, SENSOR_FRAME = "tactip_tool", "tactip_sensor"
+IMAGE_TOPIC, CONTACT_TOPIC, POSE_TOPIC = "/{view}/image/compressed", "/tactip/contact", "/tactip/pose"
+TOOL_FRAME, SENSOR_FRAME = "tactip_tool", "{view}_sensor"
 """Child frames; the parent is ``base`` or ``work``. The sensor's z points out of the dome's apex, its x along the picture's x."""
 METADATA, REST = "tactip", "rest.png"
 """Name of a file's own metadata, and of the attached picture without contact."""
@@ -74,14 +74,18 @@ class _Bag:
         """Write the messages of a step. All have the time of its exposure."""
         at_ns = self._start_ns + round(step.time_s * ros.NS_PER_S)
         send = partial(self._send, at_ns=at_ns)
-        header, based = ros.header_of(at_ns, SENSOR_FRAME), ros.header_of(at_ns, self._about.frame)
+        views = self._about.views
+        sensor, based = SENSOR_FRAME.format(view=views[0]), ros.header_of(at_ns, self._about.frame)
+        header = ros.header_of(at_ns, sensor)
         if self._static is not None and not self.count:
-            send(ros.TF_STATIC_TOPIC, "tf2_msgs/TFMessage", ros.transform(self._static, ros.header_of(at_ns, TOOL_FRAME), SENSOR_FRAME))
-        send(IMAGE_TOPIC, "sensor_msgs/CompressedImage", {"header": header, "format": "png", "data": png(step.image)})
+            send(ros.TF_STATIC_TOPIC, "tf2_msgs/TFMessage", ros.transform(self._static, ros.header_of(at_ns, TOOL_FRAME), sensor))
+        for view, image in zip(views, step.images, strict=True):
+            seen = {"header": ros.header_of(at_ns, SENSOR_FRAME.format(view=view)), "format": "png", "data": png(image)}
+            send(IMAGE_TOPIC.format(view=view), "sensor_msgs/CompressedImage", seen)
         for name, values in step.values.items():
-            numbers, topic = values.astype(float), CHANNELS[name].topic
+            numbers, topic = values.astype(float), channel_of(name).topic
             if self._about.is_plain(name):
-                labels = "pin" if name == "pins" else ",".join(self._about.axes(name))
+                labels = "pin" if is_pins(name) else ",".join(self._about.axes(name))
                 send(topic, "std_msgs/Float32MultiArray", ros.number_array(values, labels, "axis"))
             elif name == "wrench":
                 send(topic, "geometry_msgs/WrenchStamped", {"header": header, "wrench": ros.wrench(numbers[:3], numbers[3:])})
@@ -160,23 +164,26 @@ def _read_description(path: Path) -> tuple[About, dict[str, Any], bytes | None]:
 def _steps_of(path: Path, about: About) -> Iterator[RecordStep]:
     """The steps of a file. Messages with the same sequence number belong to one step."""
     reader = library("mcap.reader")
-    named = {CHANNELS[name].topic: name for name in about.numbers}
-    topics = [IMAGE_TOPIC, *named]
+    named = {channel_of(name).topic: name for name in about.numbers}
+    pictures = [IMAGE_TOPIC.format(view=view) for view in about.views]
+    topics = [*pictures, *named]
     start_ns: int | None = None
     try:
         with path.open("rb") as file:
             found = reader.make_reader(file, validate_crcs=True).iter_messages(topics, log_time_order=False)
             for _, messages in groupby(found, key=lambda each: each[2].sequence):
-                image, values, at_ns = None, dict[str, np.ndarray](), 0
+                images, values, at_ns = dict[str, np.ndarray](), dict[str, np.ndarray](), 0
                 for schema, channel, message in messages:
                     at_ns, fields = message.log_time, ros.decode(schema.name.replace("/msg/", "/"), message.data)
-                    if channel.topic == IMAGE_TOPIC:
-                        image = image_of(fields["data"].tobytes(), about.gray, str(path))
+                    if channel.topic in pictures:
+                        images[channel.topic] = image_of(fields["data"].tobytes(), about.gray, str(path))
                     else:
                         values[named[channel.topic]] = _numbers(named[channel.topic], fields, about)
                 start_ns = at_ns if start_ns is None else start_ns
-                if image is not None:
-                    yield RecordStep(image, (at_ns - start_ns) / ros.NS_PER_S, {name: values[name] for name in about.numbers})
+                if images:
+                    image, *beside = (images[topic] for topic in pictures)
+                    found_values = {name: values[name] for name in about.numbers}
+                    yield RecordStep(image, (at_ns - start_ns) / ros.NS_PER_S, found_values, tuple(beside))
     except RecordError:
         raise
     except Exception as error:  # the libraries raise exceptions of any type for damaged files

@@ -10,6 +10,7 @@ import math
 import os
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
@@ -24,7 +25,7 @@ from twin.errors import ErrorsAs, FrameError, StoreError, format_count
 from twin.frames.forms import times
 from twin.frames.images import read_image, write_image
 from twin.frames.videos import describe_pauses
-from twin.records.record import CHANNELS, About, Episode, Records, RecordStep, digest, float32, seconds
+from twin.records.record import CHANNELS, POSE_AXES, About, Episode, Records, RecordStep, digest, float32, seconds
 from twin.rig.mounting import Mounting
 from twin.store import contents, write_json, writing
 from twin.types import Form, Frame
@@ -271,23 +272,28 @@ def session_records(folder: Path) -> Records:
     session = Session(folder)
     first, first_s, image = session.steps[0], session.frame(0).time_s, session.frame(0).image
     estimates = tuple(map(str, first.get("names", [])))
-    numbers = {name: 6 for name, key in _POSES.items() if key in first} | {name: len(estimates) for name in _ESTIMATES if estimates}
+    counts = {"pose": 6, "action": 6, "width": 1} | dict.fromkeys(("estimate", "low", "high"), len(estimates))
+    counts["pins"] = 2 * len(first["pins"]) if isinstance(first.get("pins"), list) else 0
+    names: dict[str, tuple[str, ...]] = {}
+    if "sent_mm" in first:
+        counts["action"], names = 7, {"action": (*POSE_AXES, "width")}
     size_px = image.shape[1], image.shape[0]
     about = About(
         sensor=str(session.about.get("sensor", "")),
         form=session.form,
         size_px=size_px,
         gray=image.ndim == 2,
-        numbers={name: numbers[name] for name in CHANNELS if name in numbers},
+        numbers={name: counts[name] for name in CHANNELS if name in _KEYS and _KEYS[name][0] in first and counts[name]},
         estimates=estimates,
         frame="base",
         robot=str(session.about.get("arm", "")),
+        names=names,
     )
     touched = session.about.get("object")
     rest = session.rest
     episode = Episode(
         key=f"{folder.name}#{digest(session.about, first)}",
-        task=f"follow the {touched}" if touched else "watch what the sensor touches",
+        task=f"follow the {touched}" if touched else "grip" if "gripper" in session.about else "watch what the sensor touches",
         steps=partial(_steps_of, session, about, first_s),
         length=len(session.steps),
         rest=None if rest is None else rest.image,
@@ -298,12 +304,42 @@ def session_records(folder: Path) -> Records:
 
 
 # Keys of a step's line that hold the numbers of a channel.
-_POSES = {"pose": "exposed_pose", "action": "sent"}
-_ESTIMATES = {"estimate": "value", "low": "low", "high": "high"}
+_KEYS: dict[str, tuple[str, ...]] = {"pins": ("pins",), "pose": ("exposed_pose",), "width": ("width_mm",), "action": ("sent", "sent_mm")}
+_KEYS |= {"estimate": ("value",), "low": ("low",), "high": ("high",)}
+
+
+def rig_records(folder: Path) -> Records | None:
+    """The sessions of several sensors on one rig, in subfolders that have the sensors' names, as one record; None if there are none.
+
+    Raises
+    ------
+    FrameError
+        As for ``session_records``, or the sessions do not fit together.
+    """
+    views = [each.name for each in sorted(folder.iterdir()) if is_session(each)]
+    named = [Session(folder / view).about.get("sensors") for view in views]
+    if len(views) < 2 or not all(isinstance(names, list) and all(view in names for view in views) for names in named):
+        return None
+    parts = [session_records(folder / view) for view in views]
+    about, episodes = parts[0].about, [records.episodes[0] for records in parts]
+    for view, records in zip(views, parts, strict=True):
+        if wrong := about.differs(records.about):
+            raise FrameError(f"{folder}: {view} does not fit {views[0]} ({'; '.join(wrong)}); translate each session alone")
+    numbers = {f"pins.{view}": count for name, count in about.numbers.items() if name == "pins" for view in views}
+    numbers |= {name: count for name, count in about.numbers.items() if name != "pins"}
+
+    def steps() -> Iterator[RecordStep]:
+        for each in zip(*(episode.steps() for episode in episodes), strict=False):
+            pins = {f"pins.{view}": step.values["pins"] for view, step in zip(views, each, strict=True) if "pins" in step.values}
+            values = {name: value for name, value in each[0].values.items() if name != "pins"}
+            yield replace(each[0], values=pins | values, beside=tuple(step.image for step in each[1:]))
+
+    key = f"{folder.name}#{digest(*(episode.key for episode in episodes))}"
+    joined = replace(episodes[0], key=key, steps=steps, length=min(episode.length for episode in episodes))
+    return Records(replace(about, numbers=numbers, views=tuple(views)), [joined], [note for records in parts for note in records.notes])
 
 
 def _steps_of(session: Session, about: About, first_s: float) -> Iterator[RecordStep]:
-    keys = {name: (_POSES | _ESTIMATES)[name] for name in about.numbers}
     for index, line in enumerate(session.steps):
         frame = session.frame(index)
         if frame.image.shape[1::-1] != about.size_px:
@@ -311,8 +347,17 @@ def _steps_of(session: Session, about: About, first_s: float) -> Iterator[Record
             raise FrameError(
                 f"{session.folder}: {line['frame']['file']}: expected {expected} as the first frame, got {got}; record it again"
             )
-        values = {name: float32(line.get(key, []), about.numbers[name]) for name, key in keys.items()}
+        try:
+            values = {name: _numbers_in(line, name, about) for name in about.numbers}
+        except (TypeError, ValueError) as error:
+            raise FrameError(f"{session.folder}: {STEPS}, line {index + 1} holds no numbers ({error}); copy the session again") from error
         yield RecordStep(frame.image, seconds(session.step_s(index) - first_s), values)
+
+
+def _numbers_in(line: dict, name: str, about: About) -> np.ndarray:
+    """The numbers of a channel in a step's line."""
+    parts = [np.ravel(np.asarray(line.get(key, []), object)) for key in _KEYS[name]]
+    return float32(np.concatenate(parts), about.numbers[name]).reshape(about.shape(name))
 
 
 def _started_s(session: Session) -> float:

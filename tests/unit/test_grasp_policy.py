@@ -28,7 +28,7 @@ def test_a_live_policy_observes_and_commands_what_the_environment_has():
     policy = GraspPolicy(lambda each: observed.append(each) or actions[len(observed) - 1], OBJECT_MM)
     actions = rng.uniform(-0.5, 1.5, (40, 1))
     for index in range(2 * SETTLE_STEPS):
-        motion, width_mm = policy(step_with(index, grasp._rest_px))
+        motion, width_mm = policy(step_with(index, grasp.rest_px))
         assert not motion.any() and width_mm == (OBJECT_MM + 4 if index < SETTLE_STEPS else OBJECT_MM - 2)
     hand_mm = 0.0
     for index, action in enumerate(actions):

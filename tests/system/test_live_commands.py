@@ -243,7 +243,7 @@ def test_collect_in_the_twin_makes_a_recording_that_is_gone_on_with(tmp_path):
         "huggingface",
         "--count",
     )
-    assert "1 contacts" in run(*arguments, 1)
+    assert "1 contact in" in run(*arguments, 1)
     assert len(open_records(tmp_path / "huggingface").episodes) == 1
     assert "(1 new)" in run(*arguments, 2)
     kept = open_records(tmp_path / "huggingface")

@@ -17,6 +17,7 @@ from hardware.arms.awake import awake_s
 from hardware.errors import Connection, DeviceError, StaleDataError
 from scenes.sensor import SensorSpec
 from twin.camera.capture import record
+from twin.errors import format_count
 from twin.frames.forms import form_named, frame_size, gray_levels
 from twin.types import Form, Frame
 
@@ -151,11 +152,11 @@ class LiveSource(Connection):
             outages_s, torn, found = list(self._outages_s), list(self._torn), list(self._notes)
         if outages_s:
             spent = f"{sum(outages_s):.1f} s in all, the longest {max(outages_s):.1f} s: no new picture came"
-            found.append(f"{len(outages_s)} {'outage' if len(outages_s) == 1 else 'outages'} of the camera, {spent}")
+            found.append(f"{format_count(len(outages_s), 'outages of the camera')}, {spent}")
         if self.lost:
             found.append(f"pictures lost before they arrived: {self.lost}; the camera's numbers have gaps")
         if self.reopened:
-            found.append(f"the camera was opened again {self.reopened} {'time' if self.reopened == 1 else 'times'}")
+            found.append(f"the camera was opened again {format_count(self.reopened, 'times')}")
         if torn:
             found.append(f"pictures left out, incomplete or damaged: {len(torn)}; the last: {torn[-1]}")
         if self._repeated:

@@ -20,7 +20,7 @@ from av.logging import Capture
 from av.video.stream import VideoStream
 
 from scenes.files import quote, require_regular
-from twin.errors import ErrorsAs, FrameError
+from twin.errors import ErrorsAs, FrameError, format_count
 from twin.frames.forms import times
 from twin.frames.images import NOT_TURNED, picture_of
 
@@ -134,7 +134,7 @@ def describe_pauses(times_s: Sequence[float] | np.ndarray) -> str:
         return ""
     most = int(np.argmax(steps_s))
     known = f"the longest {steps_s[most]:.3g} s after frame {most}; usually {usual_s:.3g} s from frame to frame"
-    return f"{len(long)} {'pause' if len(long) == 1 else 'pauses'}, {steps_s[long].sum():.3g} s in all, {known}"
+    return f"{format_count(len(long), 'pauses')}, {steps_s[long].sum():.3g} s in all, {known}"
 
 
 def is_cut(path: Path) -> bool:

@@ -116,7 +116,7 @@ class SkinPainter:
         str
             "" if PyVista drew it, else the reason why matplotlib drew a simpler picture.
         """
-        reason = self._wait()
+        reason = self.wait()
         if not reason:
             write_bytes(path, self._drawn.read_bytes())
             return ""
@@ -125,11 +125,8 @@ class SkinPainter:
         save_figure(path, plain_figure(self._surfaces["skin"], self._surfaces["object"]), dpi=100)
         return reason
 
-    @property
-    def _drawn(self) -> Path:
-        return Path(self._folder.name) / DRAWN
-
-    def _wait(self) -> str:
+    def wait(self) -> str:
+        """Wait for the picture that was begun; "" if PyVista drew it, else the reason why not."""
         try:
             code = self._child.wait(CHILD_TIMEOUT_S)
         except subprocess.TimeoutExpired:
@@ -137,6 +134,10 @@ class SkinPainter:
         if code == 0 and self._drawn.is_file():
             return ""
         return f"VTK can't draw offscreen here (exit {code}); {REMEDY}"
+
+    @property
+    def _drawn(self) -> Path:
+        return Path(self._folder.name) / DRAWN
 
 
 def draw_contact_skin(mesh: SensorMesh, pins: PinsSpec, state: ContactState, field: ObjectField, path: Path) -> str:
@@ -150,9 +151,9 @@ def probe_offscreen() -> str:
     """Empty if VTK can draw without a window on this machine, else the reason why not."""
     import pyvista as pv
 
-    with SkinPainter() as painter, tempfile.TemporaryDirectory() as folder:
+    with SkinPainter() as painter:
         painter.draw(pv.Sphere(), pv.Sphere(), pv.Sphere())
-        return painter.save(Path(folder) / "probe.png")
+        return painter.wait()
 
 
 def object_surface(

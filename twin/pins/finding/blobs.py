@@ -199,10 +199,12 @@ def find_blobs(gray: np.ndarray, mask: Mask, blob: BlobSpec, *, max_area_px2: fl
     if blob.erosion_px > 1:
         eroded = cv2.erode(bright, np.ones((blob.erosion_px, blob.erosion_px), np.uint8))
     most = ((eroded.shape[0] + 1) // 2) * ((eroded.shape[1] + 1) // 2)  # one in each 2 x 2 pixels
-    kind = cv2.CV_16U if most < MOST_COMPONENTS else cv2.CV_32S  # 16 bits are faster, and OpenCV refuses to run out of them
-    _, labels, boxes, _ = cv2.connectedComponentsWithStats(eroded, connectivity=8, ltype=kind)
-    labels[labels > MOST_COMPONENTS] = 0
-    labels, boxes = labels.astype(np.uint16, copy=False), boxes[: MOST_COMPONENTS + 1]
+    if most < MOST_COMPONENTS:  # 16 bits are faster, but OpenCV refuses to run out of them
+        _, labels, boxes, _ = cv2.connectedComponentsWithStats(eroded, connectivity=8, ltype=cv2.CV_16U)
+    else:
+        _, labels, boxes, _ = cv2.connectedComponentsWithStats(eroded, connectivity=8, ltype=cv2.CV_32S)
+        labels[labels > MOST_COMPONENTS] = 0
+        labels, boxes = labels.astype(np.uint16), boxes[: MOST_COMPONENTS + 1]
     grow = 2 * blob.erosion_px + 1
     grown = cv2.copyTo(labels, eroded, cv2.dilate(labels, np.ones((grow, grow), np.uint8)))
     ringed = cv2.dilate(labels, np.ones((grow + 2 * RING_PX, grow + 2 * RING_PX), np.uint8))

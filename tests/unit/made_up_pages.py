@@ -32,7 +32,6 @@ from twin.pins import make_graph, nominal_reference
 from twin.report.charts import new_figure, write_chart
 from twin.report.page import Page
 from twin.report.table import write_table
-from twin.store import write_json
 from twin.types import Form, Frame
 
 SENSOR = "mg400-127"
@@ -220,11 +219,7 @@ def realism_page(out: Path) -> Path:
         "two_sample": {"small": {"accuracy": 0.61, "low": 0.57, "high": 0.65}},
         "pose_aligned": {"pin_error_px": {"fitted": 0.9, "test": 1.01, "test_max": 2.2}, "test_images": images},
     }
-    rows, poses = realism.write_pictures(out / "pictures", pairs, "pins"), realism.write_pictures(out / "pictures", pairs[:1], "pose")
-    realism.write_tables(out, pairs, found, None)
-    write_json(out / "metrics.json", metrics)
-    plots = realism.write_plots(out / "pictures", found)
-    return realism.write_page(out / "index.html", load_sensor("ur5-331"), metrics, plots, rows, poses, found)
+    return realism.write_results(out, load_sensor("ur5-331"), metrics, pairs, found, SimpleNamespace(pairs=pairs[:1]))[0]
 
 
 def calibration(out: Path) -> Path:

@@ -235,9 +235,9 @@ def calibration(out: Path) -> Path:
 def demo(out: Path) -> Path:
     reference, chart = pins(), write_chart(out / "chart.png", lambda: new_figure(1, panel_inch=1.0)[0])
     cv2.imwrite(str(out / "skin.png"), drawn("skin.png").image)
-    graph = make_graph("voronoi", reference.pins_px, outmost=reference.outmost)
+    rest, graph = (make_graph("voronoi", scale * reference.pins_px, outmost=reference.outmost) for scale in (1.0, 1.05))
     none = np.zeros((0, 2))
-    seen = SimpleNamespace(graph=graph, found=127, pins_px=reference.pins_px, predicted_px=none, extra_px=none)
+    seen = SimpleNamespace(graph=graph, found=127, pins_px=graph.nodes_px, predicted_px=none, extra_px=none)
     frame = Frame(np.zeros((300, 300), np.uint8), Form.PROCESSED, "a.png")
     state = SimpleNamespace(force_n=np.array([0.0, 0.0, 1.0]), contact_mm=np.zeros((0, 3)), area_mm2=3.0)
     made = ContactResult(
@@ -246,7 +246,7 @@ def demo(out: Path) -> Path:
         ContactPose(2.0),
         state,
         SimpleNamespace(frame=drawn("raw.png")),
-        ObservedFrame(frame, seen, graph),
+        ObservedFrame(frame, seen, rest),
         {"press": 1.5},
     )
     page = Page("TacTip twin", "twin demo", topic="Demo")

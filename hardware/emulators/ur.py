@@ -9,7 +9,6 @@ import logging
 import random
 import re
 import socket
-import socketserver
 import struct
 import time
 from collections import defaultdict
@@ -26,6 +25,7 @@ from hardware.arms.ur.driver import DASHBOARD_PORT, EMERGENCY, IDLE, NORMAL, PAU
 from hardware.arms.ur.kinematics import UrKinematics, pose_from_ur, pose_to_ur
 from hardware.emulators.faults import SECONDS, SHARE, Emulator, Fault, Faults
 from hardware.emulators.running import require_time_scale, run_until_signal
+from hardware.emulators.servers import PortServer
 from hardware.errors import cannot_listen
 
 LOG = logging.getLogger(__name__)
@@ -240,10 +240,9 @@ class UrEmulator(Emulator):
         self.faults = Faults(FAULTS, faults)
         self.arm = UrController(self.faults, time_scale)
         self.host = host or f"127.{random.randrange(1, 255)}.{random.randrange(256)}.{random.randrange(1, 255)}"
-        self._servers: list[socketserver.ThreadingTCPServer] = []
+        self._ports: list[PortServer] = []
         self._streams: dict[socket.socket, list[str]] = {}  # the variables that each client gets
         self._owner: socket.socket | None = None  # the client whose inputs the registers take
-        self._connections: set[socket.socket] = set()
         self._ended = Event()
 
     def pose(self, time_s: float | None = None) -> np.ndarray:
@@ -270,31 +269,17 @@ class UrEmulator(Emulator):
             A port is taken, or the host is not this machine's.
         """
         for port, serve in ((DASHBOARD_PORT, self._serve_dashboard), (SCRIPT_PORT, self._serve_scripts), (RTDE_PORT, self._serve_rtde)):
-
-            def handle(connection: socket.socket, *_: Any, serve: Callable[[socket.socket], None] = serve) -> Any:
-                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                self._connections.add(connection)
-                with contextlib.suppress(OSError, struct.error):
-                    serve(connection)
-                self._connections.discard(connection)
-
             try:
-                server = _Server((self.host, port), handle)
+                self._ports.append(PortServer((self.host, port), serve))
             except OSError as error:
                 self.unplug()
                 raise cannot_listen("ur", self.host, port, error, option="`host`") from error
-            self._servers.append(server)
-            Thread(target=server.serve_forever, args=(0.05,), daemon=True, name="ur-emulator").start()
 
     def unplug(self) -> None:
         """Lose every connection. The arm goes on."""
-        for server in self._servers:
-            server.shutdown()
-            server.server_close()
-        self._servers = []
-        for connection in self._connections.copy():
-            with contextlib.suppress(OSError):
-                connection.shutdown(socket.SHUT_RDWR)
+        ports, self._ports = self._ports, []
+        for port in ports:
+            port.lose()
 
     def _run(self) -> None:
         """The controller's cycles, and the packets of each."""
@@ -368,11 +353,6 @@ class UrEmulator(Emulator):
 
 def _send(connection: socket.socket, kind: bytes, content: bytes) -> None:
     connection.sendall(struct.pack(">H", 3 + len(content)) + kind + content)
-
-
-class _Server(socketserver.ThreadingTCPServer):
-    allow_reuse_address = daemon_threads = True
-    block_on_close = False
 
 
 def emulate_ur(*, host: str = "127.0.0.1", faults: tuple[str, ...] = (), time_scale: float = 1.0) -> None:

@@ -263,6 +263,8 @@ class UR(BaseArm):
     def _close(self) -> None:
         if self._client is not None:
             self._client.end()
+        if self._enabled:  # its program could not be ended, which its watchdog does, now that nothing is sent any more
+            time.sleep(1 / WATCHDOG_HZ)
         self._client = None
         self._enabled = self._under_way = self._unstopped = False
 

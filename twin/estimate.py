@@ -1,6 +1,7 @@
 """Interface of a trained model: it takes a frame, and returns an estimate with its interval."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -81,6 +82,56 @@ class SensorModel(Protocol):
 
     def check(self, sensor: SensorSpec, form: Form) -> None:
         """Raise an error if the model was not trained on frames of this sensor and form."""
+
+
+@dataclass(frozen=True)
+class PinsFound:
+    """The pins of a frame, without an estimate. The attributes are those of ``Estimate``."""
+
+    seen: Observation
+    reason: str
+    names: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
+    valid: bool = False
+
+    @property
+    def value(self) -> np.ndarray:
+        """No value (0,)."""
+        return np.zeros(0)
+
+    low = high = value
+
+
+class PinsAlone:
+    """Takes a model's place where there is none: it finds the pins of a frame and estimates nothing.
+
+    Parameters
+    ----------
+    sensor : SensorSpec
+    form : Form
+    reason : str
+        Why there is no estimate.
+    """
+
+    counts_from_rest = False
+
+    def __init__(self, sensor: SensorSpec, form: Form, reason: str) -> None:
+        self.sensor, self.form, self._reason = sensor, form, reason
+        self.pipeline = Pipeline(sensor, form)
+
+    def __call__(self, frame: Frame) -> PinsFound:
+        return PinsFound(self.pipeline(frame), self._reason)
+
+    def at_rest(self, frame: Frame) -> "PinsAlone":
+        """The same; nothing is measured from the frame."""
+        return self
+
+    def seeking_rest(self) -> "PinsAlone":
+        """The same; nothing is sought."""
+        return self
+
+    def check(self, sensor: SensorSpec, form: Form) -> None:
+        """Accept all frames: the pipeline refuses those that are not the sensor's."""
 
 
 def pins_in(frame: Frame, estimate: Estimate | None, pipeline: Pipeline) -> Observation:

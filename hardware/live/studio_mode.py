@@ -21,13 +21,13 @@ from hardware.safety.safe_arm import SafeArm, try_each
 from hardware.workcell.build import check_standing
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError, TwinError, format_count
-from twin.estimate import Estimate, SensorModel, pins_in
+from twin.estimate import Estimate, PinsAlone, SensorModel, pins_in
 from twin.pins import Pipeline
 from twin.pins.check import Grade, examine
 from twin.records.session import SessionWriter
 from twin.studio.live_page import LiveFrame, chart_values, frame_numbers, frame_pictures
 from twin.studio.modes.mode import PageMode
-from twin.studio.modes.twin_mode import TwinMode
+from twin.studio.modes.twin_mode import MODEL_LOADING, TwinMode
 from twin.studio.page import LineChart, StudioPage, put
 from twin.studio.pictures import badge, numbers_html, paragraph
 from twin.studio.studio import LIVE, StudioPlan
@@ -349,14 +349,13 @@ class LiveMode(PageMode):
         """
         with self._connecting:
             self.disconnect()
-            model = self._twin.contact.model
-            if model is None:
-                raise TwinError(
-                    "no model of this sensor is loaded: wait if it still loads. Without one the mode 'Recording' and 'twin preprocess' "
-                    "find pins and graph; for estimates run 'twin dataset' and 'twin train', and start the studio with the run (`model`)"
-                )
             if not self._camera.value.strip():
                 raise TwinError("give a camera first: a number, /dev/videoN, http://..., a folder or a video")
+            model, sensor = self._twin.contact.model, self._twin.contact.setup.sensor
+            if model is None:
+                if self._twin.model_note == MODEL_LOADING:
+                    raise TwinError(f"{MODEL_LOADING}; press 'Connect' again in a moment")
+                model = PinsAlone(sensor, open_camera(self._camera.value.strip(), sensor).form, self._twin.model_note)
             feed = CameraFeed(self._camera.value.strip(), self._arm.value.strip(), model)
             self._pipeline = Pipeline(feed.model.sensor, feed.model.form, feed.model.pipeline.reference)
             self._feed = feed

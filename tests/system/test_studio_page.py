@@ -312,6 +312,24 @@ def test_live_shows_a_source_and_an_arm_that_is_read_only(studio, client, tmp_pa
     client.set("mode", "Twin")
 
 
+def test_live_shows_the_pins_of_a_sensor_without_a_model(studio, client, tmp_path):
+    folder = write_recording(tmp_path / "recording", load_sensor(SENSOR), 3)
+    contact = studio.modes[0].contact
+    until(lambda: contact.model is not None)
+    model, contact.model = contact.model, None
+    try:
+        client.set("mode", "Live")
+        client.set("camera", str(folder))
+        client.set("arm", "")
+        client.set("Connect", True)
+        html = wait_html(client, "pins found: 127 of 127")
+        assert "No estimate: there is no model of this sensor" in html
+        client.set("Disconnect", True)
+        client.set("mode", "Twin")
+    finally:
+        contact.model = model
+
+
 def test_of_feeds_connected_at_the_same_time_one_stays_and_every_other_lets_go_of_its_arm(studio, client, tmp_path, monkeypatch):
     class Feed(CameraFeed):
         def start(self, on_shot, on_end):

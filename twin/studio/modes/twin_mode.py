@@ -45,6 +45,8 @@ MOST_UNDO = 100
 """Most gestures that can be taken back."""
 MOST_FRICTION = 2.0
 """Largest friction of the slider."""
+MODEL_LOADING = "the model is being loaded"
+"""Why there is no estimate at the beginning."""
 
 
 def _as_deep(wish: ObjectPose, before_mm: float, contact: MovingContact) -> ObjectPose:
@@ -83,7 +85,7 @@ class TwinMode(PageMode):
         self._shown, self._drawn = PinColour(state.colour), OverlayChoices(state.drawn)
         self._wish, self._wished_s = state.object_pose(), 0.0
         self._undo: list[ObjectPose] = []
-        self._model_note, self._loading = "the model is being loaded", False
+        self.model_note, self._loading = MODEL_LOADING, False
         self._path: Way | None = None
         self._path_s = 0.0
         self._film: FilmWriter | None = None
@@ -142,15 +144,15 @@ class TwinMode(PageMode):
         try:
             model = self._model_of(name)
         except TwinError as error:
-            self._model_note = str(error)
+            self.model_note = str(error)
             return
 
         def use() -> None:
             if model is not None and name == self._state.sensor:
                 self.contact.use(model)
                 self.worker.show_again()
+            self.model_note = "there is no model of this sensor; give one with --model"
 
-        self._model_note = "there is no model of this sensor; give one with --model"
         self.worker.do(use)
 
     def show(self) -> None:
@@ -368,7 +370,7 @@ class TwinMode(PageMode):
             self._state, wish = state, state.object_pose()
             self._wish = _as_deep(wish, self.contact.touch_mm(wish), prepared[0]) if as_deep else wish
             self._shown, self._drawn = PinColour(state.colour), OverlayChoices(state.drawn)
-            self._model_note = "the model is being loaded"
+            self.model_note = MODEL_LOADING
             self._take_up(*prepared)
             setup = self.contact.setup
             self._form.options = tuple(str(form) for form in Form if form is Form.RAW or setup.sensor.recording is not None)
@@ -480,7 +482,7 @@ class TwinMode(PageMode):
             badge(moving, moving) + badge(answer.lit, "still" if answer.lit is Light.TRACED else "") + badge(mesh),
             paragraph(answer.stopped, "stop"),
             number_table(rows),
-            estimate_table(answer.estimate, answer.labels, missing=self._model_note)
+            estimate_table(answer.estimate, answer.labels, missing=self.model_note)
             if len(state.contact_mm)
             else paragraph("No contact, therefore no estimate.", "note"),
             paragraph(self.contact.fine_lost, "note"),

@@ -90,6 +90,14 @@ def also(error: BaseException, what: str) -> None:
         error.add_note(what)
 
 
+def undo(act: Callable[[], object], error: BaseException) -> None:
+    """Stop or switch off a device after an error. If that fails, it is added to the error."""
+    try:
+        act()
+    except DeviceError as failed:
+        also(error, str(failed))
+
+
 # Longest line about an arm or a camera, in characters. Longer messages, and notes, go to a file.
 LONGEST_LINE = 160
 # Words by which a message says that an arm may still move, and what a line says instead of all such words.

@@ -377,6 +377,8 @@ def grasp(
     object_mm: float = ...,
     safety: str | None = ...,
     also: str | Sequence[str] | None = ...,
+    ros2: str | None = ...,
+    dry_run: bool = ...,
     force: bool = ...,
     progress: Progress | bool | None = ...,
 ) -> Gripped: ...

@@ -15,7 +15,7 @@ import numpy as np
 
 from hardware.arms.kinematics import FARTHEST, Kinematics, joint_target, linear_target
 from hardware.arms.motion import turn_between_deg
-from hardware.errors import Connection, DeviceError, StaleDataError, also
+from hardware.errors import Connection, DeviceError, StaleDataError, undo
 
 # Interval in s at which feedback is read. It is shorter than the 8 ms period of the fastest feedback.
 POLL_S = 0.005
@@ -132,10 +132,7 @@ class Arm(Protocol):
 
 def stop_after(arm: "Arm | BaseArm", error: BaseException) -> None:
     """Stop an arm after an error. If the stop fails, this is added to the error."""
-    try:
-        arm.stop()
-    except DeviceError as failed:
-        also(error, str(failed))
+    undo(arm.stop, error)
 
 
 class BaseArm(Connection):
@@ -199,6 +196,15 @@ class BaseArm(Connection):
         except BaseException as error:
             if self._may_move():
                 stop_after(self, error)
+            raise
+
+    @contextmanager
+    def _watch_enabling(self) -> Iterator[None]:
+        """Context in which the arm is enabled. After any error, Ctrl-C included, it is disabled, because it may have obeyed."""
+        try:
+            yield
+        except BaseException as error:
+            undo(self.disable, error)
             raise
 
     def _require_possible(self, pose: np.ndarray) -> None:

@@ -153,10 +153,11 @@ class MG400(KinematicArm):
             )
         if self._supervised and not self._enabled:
             self._dashboard.supervise(*LAST_WORDS)
-        for request in ("EnableRobot()", "User(0)", "Tool(0)"):
-            self._ask(request)
-        self._await_mode(lambda mode: mode in ENABLED_MODES, "was not enabled; check its button and that no stop is pressed")
-        self._enabled = True
+        with self._watch_enabling():
+            self._enabled = True  # from now on it may be, even if nothing is heard of it
+            for request in ("EnableRobot()", "User(0)", "Tool(0)"):
+                self._ask(request)
+            self._await_mode(lambda mode: mode in ENABLED_MODES, "was not enabled; check its button and that no stop is pressed")
 
     def disable(self) -> None:
         self._send_over_dashboard("DisableRobot()", "disabled")

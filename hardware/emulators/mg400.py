@@ -1,14 +1,13 @@
 """A Dobot MG400 emulated on this machine, over real TCP sockets on all five ports."""
 
-import contextlib
 import logging
 import select
 import socket
-import struct
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
-from threading import Event, Lock, Thread
+from collections.abc import Sequence
+from functools import partial
+from threading import Event
 
 import numpy as np
 
@@ -28,6 +27,7 @@ from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Fault
 from hardware.emulators.mg400_commands import Mg400Commands, parse_firmware
 from hardware.emulators.mg400_controller import START_JOINTS_DEG, Mg400Controller, PlanarFrame
 from hardware.emulators.mg400_grammar import RefusedError, Request, refuse_if, take_request
+from hardware.emulators.servers import PortServer
 from hardware.errors import cannot_listen
 from twin.errors import ErrorsAs, TwinError
 
@@ -117,11 +117,8 @@ class Mg400Emulator(Emulator):
         self._commands = Mg400Commands(self.arm, version)
         self._bare, self._lenient = version < FIRST_NUMBERED_REPLIES, lenient
         self.ports: dict[int, int] = {}
-        self._sockets: list[socket.socket] = []  # bound
-        self._listeners: dict[socket.socket, int] = {}  # the bound sockets that listen, with the arm's own port
-        self._clients: dict[socket.socket, int] = {}
-        self._lock, self._ended = Lock(), Event()
-        self._threads: list[Thread] = []
+        self._servers: dict[int, PortServer] = {}  # by the arm's own ports
+        self._ended = Event()
         self._started_s = time.monotonic()
 
     def pose(self, time_s: float | None = None) -> np.ndarray:
@@ -140,28 +137,20 @@ class Mg400Emulator(Emulator):
         deaf = {MOTION_PORT} if "motion-port-closed" in self.faults else set()
         deaf |= set(FEEDBACK_PERIOD_S) if "no-feedback" in self.faults else {30004} if "no-fast-feedback" in self.faults else set()
         for port in PORTS:
-            listener = socket.socket()
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            self._sockets.append(listener)
+            at = self.host, 0 if self._port_offset is None else port + self._port_offset
             try:
-                listener.bind((self.host, 0 if self._port_offset is None else port + self._port_offset))
+                server = self._servers[port] = PortServer(at, partial(self._serve, port), deaf=port in deaf)
             except OSError as error:
                 self.stop()
-                raise cannot_listen("mg400", self.host, port + (self._port_offset or 0), error, option="`port_offset`") from error
-            self.ports[port] = listener.getsockname()[1]
-            if port not in deaf:
-                listener.listen()
-                self._listeners[listener] = port
+                raise cannot_listen("mg400", *at, error, option="`port_offset`") from error
+            self.ports[port] = server.server_address[1]
         self._started_s = time.monotonic()
-        self._start_thread(self._accept)
         self.faults.after("emergency-stop", self.arm.press_emergency_stop)
         self.faults.after("die", self.kill)
 
     def stop(self) -> None:
         """Close all connections and stop listening."""
         self._close(abruptly=False)
-        for thread in self._threads:
-            thread.join(timeout=2.0)
 
     def kill(self) -> None:
         """Emulate a power loss: every connection is reset and no port listens."""
@@ -169,55 +158,16 @@ class Mg400Emulator(Emulator):
 
     def _close(self, *, abruptly: bool) -> None:
         self._ended.set()
-        with self._lock:
-            for client in self._clients:
-                with contextlib.suppress(OSError):
-                    if abruptly:
-                        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-                        client.close()
-                    else:
-                        client.shutdown(socket.SHUT_RDWR)
-            for bound in self._sockets:
-                with contextlib.suppress(OSError):
-                    bound.shutdown(socket.SHUT_RDWR)  # wakes the thread that waits on it; otherwise the port would stay open
-                bound.close()
-            self._clients.clear()
+        for server in self._servers.values():
+            server.lose(abruptly=abruptly)
 
-    def _start_thread(self, target: Callable[..., None], *arguments: object) -> None:
-        thread = Thread(target=target, args=arguments, daemon=True, name="mg400-emulator")
-        self._threads = [*(one for one in self._threads if one.is_alive()), thread]
-        thread.start()
-
-    def _accept(self) -> None:
-        while not self._ended.is_set():
-            try:
-                ready, _, _ = select.select([one for one in self._listeners if one.fileno() >= 0], [], [], 0.05)
-                accepted = [(listener.accept()[0], self._listeners[listener]) for listener in ready]
-            except (OSError, ValueError):  # closed meanwhile
-                continue
-            for client, port in accepted:
-                with self._lock:
-                    taken = port in self._clients.values() and "one-client" in self.faults
-                    if not taken:
-                        self._clients[client] = port
-                if taken:
-                    client.close()
-                else:
-                    client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                    self._start_thread(self._serve, client, port)
-
-    def _serve(self, client: socket.socket, port: int) -> None:
-        """Serve a client until it has gone. It is hung up on even if serving fails, so that it does not wait for ever."""
-        try:
-            with contextlib.suppress(OSError, ValueError):
-                if port in FEEDBACK_PERIOD_S:
-                    self._feed(client, FEEDBACK_PERIOD_S[port])
-                else:
-                    self._converse(client, port)
-        finally:
-            with self._lock:
-                self._clients.pop(client, None)
-            client.close()
+    def _serve(self, port: int, client: socket.socket) -> None:
+        if "one-client" in self.faults and len(self._servers[port].clients) > 1:
+            return
+        if port in FEEDBACK_PERIOD_S:
+            self._feed(client, FEEDBACK_PERIOD_S[port])
+        else:
+            self._converse(client, port)
 
     def _feed(self, client: socket.socket, period_s: float) -> None:
         begun_s = due_s = time.monotonic()
@@ -276,8 +226,7 @@ class Mg400Emulator(Emulator):
 
     def _execute(self, port: int, request: Request) -> str:
         refuse_if("no-tcp-mode" in self.faults)
-        with self._lock:
-            alone = MOTION_PORT not in self._clients.values()
+        alone = not self._servers[MOTION_PORT].clients
         refuse_if(alone and ("needs-motion-client" in self.faults or "motion-port-closed" in self.faults), ErrorId.NO_SUCH_COMMAND)
         commands = self._commands.dashboard if port == DASHBOARD_PORT else self._commands.motion
         refuse_if(request.name not in commands, ErrorId.NO_SUCH_COMMAND)

@@ -9,7 +9,6 @@ import logging
 import random
 import re
 import socket
-import socketserver
 import struct
 import time
 from collections import defaultdict
@@ -22,14 +21,15 @@ from scipy.spatial.transform import Rotation
 
 from hardware.arms.kinematics import Violation
 from hardware.arms.motion import MotionTrack, Speeds
-from hardware.arms.ur.driver import EMERGENCY, IDLE, NORMAL, PAUSED, PLAYING, POWER_OFF, PROTECTIVE, RUNNING, STOPPED
+from hardware.arms.ur.driver import DASHBOARD_PORT, EMERGENCY, IDLE, NORMAL, PAUSED, PLAYING, POWER_OFF, PROTECTIVE, RUNNING, STOPPED
 from hardware.arms.ur.kinematics import UrKinematics, pose_from_ur, pose_to_ur
 from hardware.emulators.faults import SECONDS, SHARE, Emulator, Fault, Faults
 from hardware.emulators.running import require_time_scale, run_until_signal
+from hardware.emulators.servers import PortServer
 from hardware.errors import cannot_listen
 
 LOG = logging.getLogger(__name__)
-DASHBOARD_PORT, SCRIPT_PORT, RTDE_PORT = 29999, 30003, 30004
+SCRIPT_PORT, RTDE_PORT = 30003, 30004
 CYCLE_S = 0.008
 VERSION = (3, 15, 8, 0)
 START_JOINTS_DEG = (-70.0, -110.0, -90.0, -70.0, 90.0, 0.0)
@@ -59,6 +59,8 @@ FAULTS = {
     "protective-stop": Fault("each move ends in a protective stop after this share of its time", 0.5, SHARE),
     "slider": Fault("the speed slider is at this share", 0.1, SHARE),
     "ignore-moves": Fault("moves are accepted and not executed"),
+    "late-start": Fault("a control script starts this many seconds after its upload", 1.0, SECONDS),
+    "script-ends": Fault("a control script ends this many seconds after its start", 0.0, SECONDS),
 }
 
 
@@ -87,6 +89,7 @@ class UrController:
         self.robot_mode, self.safety_mode, self.runtime_state = RUNNING, NORMAL, STOPPED
         self._started_s = self._cycled_s = self.written_s = time.monotonic()
         self._program: Iterator[None] | None = None
+        self._starts_s = 0.0  # when the script starts
         self.watchdog_hz = self._locked_until_s = 0.0
         self._collides_s = np.inf  # when a fault ends the present move
 
@@ -108,8 +111,11 @@ class UrController:
                 self.protective_stop()
             if self.runtime_state == PLAYING and self._program is not None:
                 starves = self.enabled and now_s - self.written_s > 1 / self.watchdog_hz
-                if starves or next(self._program, self) is self:
+                ends_s = self.faults.value("script-ends")
+                if starves or (ends_s is not None and now_s > self._starts_s + ends_s) or next(self._program, self) is self:
                     self.end_program()
+            elif self.runtime_state == STOPPED and self._program is not None and now_s >= self._starts_s:
+                self.runtime_state = PLAYING
             joints = self.track.joints_deg(now_s)
             speed = np.radians(joints - self.kinematics.near_deg) / max(now_s - self._cycled_s, CYCLE_S / 2)
             self.kinematics.near_deg[:], self._cycled_s = joints, now_s
@@ -126,7 +132,7 @@ class UrController:
         with self.lock:
             self.end_program()
             if name == "rtde_control" and self.robot_mode == RUNNING and self.safety_mode == NORMAL:
-                self.runtime_state, self._program = PLAYING, self._control()
+                self._program, self._starts_s = self._control(), time.monotonic() + (self.faults.value("late-start") or 0.0)
 
     def end_program(self) -> None:
         """End the script; the arm stops."""
@@ -234,10 +240,9 @@ class UrEmulator(Emulator):
         self.faults = Faults(FAULTS, faults)
         self.arm = UrController(self.faults, time_scale)
         self.host = host or f"127.{random.randrange(1, 255)}.{random.randrange(256)}.{random.randrange(1, 255)}"
-        self._servers: list[socketserver.ThreadingTCPServer] = []
+        self._ports: list[PortServer] = []
         self._streams: dict[socket.socket, list[str]] = {}  # the variables that each client gets
         self._owner: socket.socket | None = None  # the client whose inputs the registers take
-        self._connections: set[socket.socket] = set()
         self._ended = Event()
 
     def pose(self, time_s: float | None = None) -> np.ndarray:
@@ -264,31 +269,17 @@ class UrEmulator(Emulator):
             A port is taken, or the host is not this machine's.
         """
         for port, serve in ((DASHBOARD_PORT, self._serve_dashboard), (SCRIPT_PORT, self._serve_scripts), (RTDE_PORT, self._serve_rtde)):
-
-            def handle(connection: socket.socket, *_: Any, serve: Callable[[socket.socket], None] = serve) -> Any:
-                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                self._connections.add(connection)
-                with contextlib.suppress(OSError, struct.error):
-                    serve(connection)
-                self._connections.discard(connection)
-
             try:
-                server = _Server((self.host, port), handle)
+                self._ports.append(PortServer((self.host, port), serve))
             except OSError as error:
                 self.unplug()
                 raise cannot_listen("ur", self.host, port, error, option="`host`") from error
-            self._servers.append(server)
-            Thread(target=server.serve_forever, args=(0.05,), daemon=True, name="ur-emulator").start()
 
     def unplug(self) -> None:
         """Lose every connection. The arm goes on."""
-        for server in self._servers:
-            server.shutdown()
-            server.server_close()
-        self._servers = []
-        for connection in self._connections.copy():
-            with contextlib.suppress(OSError):
-                connection.shutdown(socket.SHUT_RDWR)
+        ports, self._ports = self._ports, []
+        for port in ports:
+            port.lose()
 
     def _run(self) -> None:
         """The controller's cycles, and the packets of each."""
@@ -362,11 +353,6 @@ class UrEmulator(Emulator):
 
 def _send(connection: socket.socket, kind: bytes, content: bytes) -> None:
     connection.sendall(struct.pack(">H", 3 + len(content)) + kind + content)
-
-
-class _Server(socketserver.ThreadingTCPServer):
-    allow_reuse_address = daemon_threads = True
-    block_on_close = False
 
 
 def emulate_ur(*, host: str = "127.0.0.1", faults: tuple[str, ...] = (), time_scale: float = 1.0) -> None:

@@ -21,7 +21,7 @@ from hardware.servo.loop import ServoLoop, require_labels
 from hardware.servo.step import LoopHooks, LoopSettings, StepRecord
 from hardware.servo.timing import Timing
 from hardware.servo.trajectory import Measures, Trajectory, comparison_figure, measure, trajectory_figure, trajectory_of, write_csv
-from hardware.workcell.build import TWIN, Rig, build_rig, check_plan, load_rest_frame
+from hardware.workcell.build import TWIN, DryRunDone, Rig, build_rig, check_plan, load_rest_frame
 from scenes import ObjectSpec, ServoSpec, load_experiment
 from scenes.files import quote
 from twin.errors import OptionError, StoreError, TwinError, format_count
@@ -165,17 +165,6 @@ class FollowPlan:
                     "that the arm reports, and these do not show the real contact"
                 )
             object.__setattr__(self, "camera", TWIN)
-
-
-@dataclass(frozen=True)
-class DryRunDone:
-    """The result of a plan that was checked, and not carried out."""
-
-    failure: str = ""
-
-    def lines(self) -> list[str]:
-        """The result as lines of text."""
-        return ["nothing was moved; run it without `dry_run` to begin"]
 
 
 @dataclass(frozen=True)

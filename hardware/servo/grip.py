@@ -6,9 +6,10 @@ ends with an error if that lasts. At the end the arm is stopped and disabled; th
 arm does not press the sensors, the gripper does. Only the policy and the gripper's own limit of force guard the grip.
 """
 
+import logging
 import time
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -26,7 +27,8 @@ from hardware.safety.decide import Sensed
 from hardware.safety.eyes import ArmWatch, FreshFrames
 from hardware.safety.safe_arm import SafeArm, try_each
 from hardware.servo.grippers import Gripper, open_gripper
-from hardware.workcell.build import FRAME_S, TWIN_FRAME_S, open_guarded_arm
+from hardware.workcell.build import FRAME_S, TWIN_FRAME_S, DryRunDone, check_standing, open_guarded_arm
+from hardware.workcell.ros2 import publishing
 from scenes.files import quote
 from scenes.sensor import SensorSpec
 from twin.errors import OptionError
@@ -37,6 +39,8 @@ from twin.records.session import SessionWriter
 from twin.store import writes
 from twin.types import Form, Frame, Observation
 
+LOG = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class GripperRig:
@@ -45,6 +49,15 @@ class GripperRig:
     sources: Mapping[str, FrameSource]
     arm: Arm
     gripper: Gripper
+
+    @contextmanager
+    def connect(self) -> Iterator[None]:
+        """Context in which the arm and the cameras are connected."""
+        with ExitStack() as stack:
+            stack.enter_context(self.arm)
+            for source in self.sources.values():
+                stack.enter_context(source)
+            yield
 
 
 @dataclass(frozen=True)
@@ -85,6 +98,7 @@ def run_gripper(
     period_s: float = 0.0,
     timeout_s: float = FRAME_S,
     give_up_s: float = 3.0,
+    ros2: str | None = None,
 ) -> list[GripStep]:
     """Run a policy on a gripper with several sensors.
 
@@ -102,6 +116,8 @@ def run_gripper(
         Least time between two decisions.
     timeout_s, give_up_s : float
         Longest wait for a frame, and longest time without valid pins.
+    ros2 : str, optional
+        Namespace in which each sensor has its own, ``NAME/left``, with its frames and pins and the arm's pose as ROS 2 topics.
 
     Returns
     -------
@@ -114,9 +130,7 @@ def run_gripper(
     """
     found: list[GripStep] = []
     with ExitStack() as stack:
-        stack.enter_context(rig.arm)
-        for source in rig.sources.values():
-            stack.enter_context(source)
+        stack.enter_context(rig.connect())
         about = {"arm": rig.arm.name, "gripper": rig.gripper.name, "sensors": list(rig.sources)}
         records = {}
         for name, source in rig.sources.items():
@@ -124,6 +138,9 @@ def run_gripper(
                 entries = about | {"sensor": pipelines[name].spec.name, "camera": source.name}
                 records[name] = stack.enter_context(SessionWriter(out / name, entries))
         watch, eyes = ArmWatch(rig.arm), FreshFrames(rig.arm, cast(FrameSource, _AllSources(rig.sources)))
+        for name, source in rig.sources.items():
+            of = ros2 and f"{ros2}/{name}"
+            stack.enter_context(publishing(of, source, pipelines[name], estimates=False, arm=lambda: watch.newest))
         stack.enter_context(watch.alert())
         stack.callback(lambda: try_each(stop=rig.arm.stop, disable=rig.arm.disable))
         stack.enter_context(watch.watching())
@@ -177,6 +194,10 @@ class GripPlan:
         As for ``build_rig``.
     also : tuple of str
         Further formats in which the records are kept.
+    dry_run : bool
+        End after the check of the cameras and of the arm's place, before anything moves.
+    ros2 : str or None
+        As for ``run_gripper``.
     """
 
     sensor: SensorSpec
@@ -186,6 +207,8 @@ class GripPlan:
     arm: str = "simulated"
     limits: str | None = None
     also: tuple[str, ...] = ()
+    dry_run: bool = False
+    ros2: str | None = None
 
     @property
     def form(self) -> Form:
@@ -232,7 +255,9 @@ class Gripped:
 
 
 @writes("left", "right", *ALSO)
-def grip(plan: GripPlan, policy: Decide, out: Path, *, steps: int, period_s: float = 0.0, progress: Progress = silent) -> Gripped:
+def grip(
+    plan: GripPlan, policy: Decide, out: Path, *, steps: int, period_s: float = 0.0, progress: Progress = silent
+) -> Gripped | DryRunDone:
     """Run a policy, and write the records to ``out``: a session for each sensor, and all of them in further formats.
 
     Raises
@@ -242,6 +267,12 @@ def grip(plan: GripPlan, policy: Decide, out: Path, *, steps: int, period_s: flo
     """
     kept, rig = KeptAlso(out, plan.also, plan.sensor), plan.build()
     pipelines, found = {name: Pipeline(plan.sensor, plan.form) for name in rig.sources}, list[GripStep]()
+    if plan.dry_run:
+        with rig.connect():
+            for name, source in rig.sources.items():
+                for line in check_standing(source, rig.arm, pipelines[name]):
+                    LOG.warning("%s: %s", name, line)
+        return DryRunDone()
     with stage(progress, f"policy on {rig.gripper.name}") as report, kept:
 
         def decide(step: GripStep) -> tuple[np.ndarray, float]:
@@ -251,7 +282,7 @@ def grip(plan: GripPlan, policy: Decide, out: Path, *, steps: int, period_s: flo
 
         try:
             timeout_s = TWIN_FRAME_S if any(isinstance(source, TwinCamera) for source in rig.sources.values()) else FRAME_S
-            run_gripper(rig, pipelines, decide, steps=steps, out=out, period_s=period_s, timeout_s=timeout_s)
+            run_gripper(rig, pipelines, decide, steps=steps, out=out, period_s=period_s, timeout_s=timeout_s, ros2=plan.ros2)
         finally:
             if len(found) > 1:  # a step is written after its move
                 kept.catch_up()

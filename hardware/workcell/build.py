@@ -206,6 +206,17 @@ def draw_window(sensor: SensorSpec, form: Form, plain_light: bool) -> Preview:
     return preview
 
 
+@dataclass(frozen=True)
+class DryRunDone:
+    """The result of a plan that was checked, and not carried out."""
+
+    failure: str = ""
+
+    def lines(self) -> list[str]:
+        """The result as lines of text."""
+        return ["nothing was moved; run it without `dry_run` to begin"]
+
+
 def check_plan(
     rig: Rig,
     pipeline: Pipeline,
@@ -291,8 +302,8 @@ def check_sight(source: FrameSource, pipeline: Pipeline, *, at_rest: Callable[[F
     ]
 
 
-def check_standing(source: FrameSource, arm: SafeArm, pipeline: Pipeline) -> list[str]:
-    """Check a connected arm that a person will move in small steps from where it stands; parameters, lines and errors as for
+def check_standing(source: FrameSource, arm: Arm, pipeline: Pipeline) -> list[str]:
+    """Check a connected arm that will move in small steps from where it stands; parameters, lines and errors as for
     ``check_plan``."""
     seen, here = check_sight(source, pipeline), arm.state().pose
     if why := _forbidden(arm, here, here):

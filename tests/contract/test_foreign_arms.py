@@ -188,9 +188,8 @@ def test_echoes_of_moves_that_nobody_reads_do_not_stop_the_lenient_emulator():
     """The connection has room for a few thousand of them; here it has less."""
     with Mg400Emulator(port_offset=None, lenient=True, time_scale=50.0) as emulator, mg400_of(emulator) as arm:
         arm._motion._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
-        for client, port in emulator._clients.items():
-            if port == 30003:
-                client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 2048)
+        for client in emulator._servers[30003].clients:
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 2048)
         arm.enable()
         for n in range(1000):
             arm.move_linear(np.array([300.0, n % 2, 0, 0, 0, 10]), wait=False)

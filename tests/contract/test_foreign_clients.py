@@ -380,7 +380,7 @@ def test_a_client_that_is_lost_while_it_waits_is_no_failed_command(caplog):
         client.motion.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         client.motion.close()
         deadline = time.monotonic() + 5
-        while 30003 in emulator._clients.values():
+        while emulator._servers[30003].clients:
             assert time.monotonic() < deadline
             time.sleep(0.01)
         assert client.ask(client.dashboard, "RobotMode()") == "0,{7},RobotMode();"

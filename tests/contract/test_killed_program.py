@@ -78,7 +78,7 @@ def test_a_program_that_ends_as_it_should_leaves_no_supervisor(kind):
         assert process.wait(timeout=10) == 0
         time.sleep(0.3)
         if kind != "magician":
-            assert not (emulator._streams if kind == "ur" else emulator._clients)
+            assert not (emulator._streams if kind == "ur" else any(server.clients for server in emulator._servers.values()))
 
 
 def test_it_sends_nothing_when_it_is_ended_and_all_when_its_program_is_gone():

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -90,8 +91,6 @@ class OnePipeline:
         self.reason = ""
 
     def __call__(self, frame):
-        from types import SimpleNamespace
-
         return SimpleNamespace(valid=not self.reason, reason=self.reason, pins_px=np.zeros((3, 2)))
 
 
@@ -183,6 +182,34 @@ def test_a_gripper_behind_ros_2_gets_its_width(joints, sent_m, monkeypatch):
 
 CLOSINGS, GRASP_STEPS = 13, 55
 """Decisions in which the fingers close, to 1.6 N, and all of a short run. The block needs 1.5 N."""
+
+
+def test_a_dry_run_checks_both_sensors_and_moves_nothing(tmp_path, monkeypatch, caplog):
+    pytest.importorskip("mujoco", reason="mujoco (the extra) is not installed")
+    monkeypatch.setattr(SimulatedArm, "enable", lambda arm: pytest.fail("enabled"))
+    done = grip(GripPlan(load_sensor(SENSOR), dry_run=True), lambda step: pytest.fail("asked"), tmp_path / "out", steps=1)
+    assert "nothing was moved" in done.lines()[0] and not (tmp_path / "out" / "left").exists()
+    assert all(f"{name}: sensor: 331 of 331 pins" in caplog.text and f"{name}: limits: " in caplog.text for name in ("left", "right"))
+
+
+def test_both_sensors_are_published(monkeypatch):
+    pytest.importorskip("cyclonedds", reason="cyclonedds (the extra ros2) is not installed")
+    from hardware.ros2.dds import Participant
+
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(random.randrange(1, 230)))
+    monkeypatch.setattr(OnePipeline, "reference", None, raising=False)
+    hand = SimpleNamespace(name="hand", width_mm=9.0, move=lambda width_mm: None)
+    rig = GripperRig({"left": NoisyCamera(), "right": NoisyCamera()}, SimulatedArm(time_scale=np.inf), hand)
+    readers, seen = {name: Participant().reader(f"/hand/{name}/image", "sensor_msgs/Image") for name in rig.sources}, set()
+
+    def decide(step):
+        seen.update(name for name, reader in readers.items() if reader.take())
+        time.sleep(0.05)
+        return np.zeros(6), 9.0
+
+    run_gripper(rig, dict.fromkeys(rig.sources, OnePipeline()), decide, steps=60, ros2="hand")
+    assert seen == {"left", "right"}
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 from command import run_twin
 
 from scenes import load_object, load_sensor
-from twin.evaluation.pictures.realism import run_realism
+from training.studies.realism import compare_with_renders
 from twin.mechanics import ContactPose
 from twin.simulator import Simulator
 
@@ -29,7 +29,8 @@ def folder(tmp_path_factory):
 @pytest.mark.slow
 def test_a_render_looks_like_itself(folder, tmp_path):
     """The skin fitted to the detected pins gives the same picture again, but for noise and a few hundredths of a pixel."""
-    metrics, written = run_realism(folder, load_sensor(SENSOR), tmp_path)
+    made = compare_with_renders(folder, load_sensor(SENSOR), tmp_path, test=False)
+    metrics, written = made.metrics, made.written
     assert metrics["refused"] == [{"image_name": "dark.png", "reason": metrics["refused"][0]["reason"]}]
     images, found = metrics["pin_aligned"], metrics["statistics"]
     assert images["exact_fraction"] == 1.0

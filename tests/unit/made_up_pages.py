@@ -19,7 +19,7 @@ from training.studies.tac_vgnn.study import AreaChange, contacts_figure
 from twin.calibration.contact.report import write_calibration
 from twin.calibration.optics import Calibration
 from twin.calibration.optics import write_page as write_calibration_page
-from twin.demo.make_demo import DepthRow, add_contact, add_motions, add_tables
+from twin.demo.make_demo import ContactResult, DepthRow, add_contact, add_motions, add_tables
 from twin.demo.make_demo import write_page as write_demo_page
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.evaluation.pictures import report as realism
@@ -28,11 +28,12 @@ from twin.evaluation.pictures.frames import RealFrame
 from twin.evaluation.pictures.images import ImageFigures
 from twin.evaluation.pictures.spectra import RadialRow
 from twin.evaluation.pictures.statistics import RADIAL_MEASURES
+from twin.mechanics.path import ContactPose
 from twin.pins import make_graph, nominal_reference
 from twin.report.charts import new_figure, write_chart
 from twin.report.page import Page
+from twin.report.plots import ObservedFrame
 from twin.report.table import write_table
-from twin.store import write_json
 from twin.types import Form, Frame
 
 SENSOR = "mg400-127"
@@ -220,11 +221,7 @@ def realism_page(out: Path) -> Path:
         "two_sample": {"small": {"accuracy": 0.61, "low": 0.57, "high": 0.65}},
         "pose_aligned": {"pin_error_px": {"fitted": 0.9, "test": 1.01, "test_max": 2.2}, "test_images": images},
     }
-    rows, poses = realism.write_pictures(out / "pictures", pairs, "pins"), realism.write_pictures(out / "pictures", pairs[:1], "pose")
-    realism.write_tables(out, pairs, found, None)
-    write_json(out / "metrics.json", metrics)
-    plots = realism.write_plots(out / "pictures", found)
-    return realism.write_page(out / "index.html", load_sensor("ur5-331"), metrics, plots, rows, poses, found)
+    return realism.write_results(out, load_sensor("ur5-331"), metrics, pairs, found, SimpleNamespace(pairs=pairs[:1]))[0]
 
 
 def calibration(out: Path) -> Path:
@@ -236,12 +233,24 @@ def calibration(out: Path) -> Path:
 
 
 def demo(out: Path) -> Path:
-    cv2.imwrite(str(out / "picture.png"), drawn("picture.png").image)
-    chart = write_chart(out / "chart.png", lambda: new_figure(1, panel_inch=1.0)[0])
-    pictures = {kind: out / "picture.png" for kind in ("skin", "raw", "recorded")} | {kind: chart for kind in ("pins", "areas", "surfaces")}
+    reference, chart = pins(), write_chart(out / "chart.png", lambda: new_figure(1, panel_inch=1.0)[0])
+    cv2.imwrite(str(out / "skin.png"), drawn("skin.png").image)
+    rest, graph = (make_graph("voronoi", scale * reference.pins_px, outmost=reference.outmost) for scale in (1.0, 1.05))
+    none = np.zeros((0, 2))
+    seen = SimpleNamespace(graph=graph, found=127, pins_px=graph.nodes_px, predicted_px=none, extra_px=none)
+    frame = Frame(np.zeros((300, 300), np.uint8), Form.PROCESSED, "a.png")
+    state = SimpleNamespace(force_n=np.array([0.0, 0.0, 1.0]), contact_mm=np.zeros((0, 3)), area_mm2=3.0)
+    made = ContactResult(
+        load_sensor(SENSOR),
+        load_object("plane").model_copy(update={"name": HOSTILE}),
+        ContactPose(2.0),
+        state,
+        SimpleNamespace(frame=drawn("raw.png")),
+        ObservedFrame(frame, seen, rest),
+        {"press": 1.5},
+    )
     page = Page("TacTip twin", "twin demo", topic="Demo")
-    page.section(f"{SENSOR} against {HOSTILE}", "A plane.")
-    add_contact(page, f"{SENSOR} against {HOSTILE}", pictures, "64 x 48 px", [("force on the object, N", "(0, 0, 1)")])
+    add_contact(page, made, out / "skin.png")
     add_motions(page, chart)
     add_tables(page, {SENSOR: [DepthRow(1.5, 2.0, 1.9, 12.3, 0.5)]})
     return write_demo_page(out / "index.html", page, "Rendered here.", {"motions": 1.5})

@@ -3,6 +3,7 @@
 import csv
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -19,10 +20,10 @@ from twin.evaluation.degradation.conditions import CONDITIONS
 from twin.evaluation.degradation.envelope import NEAR, Envelope, crossing, curves_of, envelopes_of, evaluate_sweep, shares_of
 from twin.evaluation.degradation.measures import MEASURES, measure_frame
 from twin.evaluation.degradation.plan import ConditionPlan, SweepPlan, load_plan
-from twin.evaluation.degradation.report import _share_row, compare
+from twin.evaluation.degradation.report import _share_row, compare, write_report
 from twin.evaluation.degradation.shots import DegradedFrame, RealSource
-from twin.evaluation.degradation.study import check_pipelines, consensus, study
-from twin.evaluation.degradation.sweep import ModelAnswer, SweepSettings, cells_of, run_sweep
+from twin.evaluation.degradation.study import check_pipelines, consensus
+from twin.evaluation.degradation.sweep import SweepSettings, cells_of, run_sweep
 from twin.pins import Found, make_detector, shipped_detector
 from twin.pins.labelling.reference import nominal_reference
 from twin.types import Form, Frame
@@ -186,11 +187,8 @@ def test_a_sweep_writes_its_page_and_goes_on_where_it_was(spec, frames, tmp_path
     plan = real_plan(spec, frames)
     counts = []
 
-    def progress(stage, done, total, note=""):
-        if total:
-            counts.append((done, total))
-
-    envelopes, written = study(plan, "drawn", tmp_path, progress=progress)
+    judged = evaluate_sweep(plan, tmp_path, jobs=1, progress=lambda done, total: counts.append((done, total)))
+    envelopes, written = judged.envelopes, write_report(tmp_path, judged, source="drawn", notes=[])
     assert all(path.stat().st_size for path in written)
     page = read_sound_page(written[0].read_text(encoding="utf-8"), tmp_path)
     assert all(case.title in page.text for case in plan.cases)
@@ -220,12 +218,15 @@ def test_two_processes_find_what_one_does(spec, frames, tmp_path):
 
 def levels_of_light(source):
     """A model in a sweep's hands: says how bright the frame is."""
-    return {"meter": measured_light}
+    return {"meter": LightMeter()}
 
 
-def measured_light(frame):
-    light = np.array([frame.image.mean()])
-    return ModelAnswer(light, light - 1, light + 1, ("mm",), np.array([255.0]), True)
+class LightMeter:
+    form, label_range = Form.RAW, np.array([255.0])
+
+    def __call__(self, frame):
+        light = np.array([frame.image.mean()])
+        return SimpleNamespace(value=light, low=light - 1, high=light + 1, units=("mm",), valid=True)
 
 
 def test_models_are_asked_about_every_frame(spec, frames, tmp_path):

@@ -1,23 +1,21 @@
 """Study: how far may a sensor degrade before pipelines lose its pins, and what do trained models estimate then?"""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scenes import SensorSpec
-from scenes.sensor import RecordingSpec
 from twin.camera.capture import in_form
-from twin.evaluation.degradation.envelope import Envelope
+from twin.evaluation.degradation.envelope import Envelope, evaluate_sweep
 from twin.evaluation.degradation.plan import SweepPlan
-from twin.evaluation.degradation.report import REPORT_FILES
+from twin.evaluation.degradation.report import REPORT_FILES, write_report
 from twin.evaluation.degradation.shots import CONTACTS, RealSource, RenderedSource
-from twin.evaluation.degradation.study import check_pipelines, real_study, rendered_study
-from twin.evaluation.degradation.sweep import ModelAnswer, SweepSettings
-from twin.progress import Progress, silent
+from twin.evaluation.degradation.study import check_pipelines, choose_pipelines, real_settings
+from twin.evaluation.degradation.sweep import SweepSettings
+from twin.progress import Progress, silent, stage
 from twin.store import writes
-from twin.types import Frame, ReadableResult
+from twin.types import Form, ReadableResult
 
 if TYPE_CHECKING:
     from training.estimate.estimator import PoseEstimator  # loads torch, which pipelines alone do not need
@@ -78,36 +76,48 @@ class DegradationResult(ReadableResult):
 def run(plan: DegradationPlan, out: Path, *, progress: Progress = silent) -> DegradationResult:
     """Sweep every condition from severity 0 to 1, evaluate pipelines and models on every frame, and write the result.
 
-    The folder ``out`` must exist. Results of an earlier call there are used again if their inputs have not changed.
+    The folder ``out`` must exist. Results of an earlier call there are used again if their inputs have not changed. Of real frames only
+    the image-level conditions are swept. If they are raw, rendered frames are also swept (in ``out/rendered``), and both are compared.
 
     Raises
     ------
     TwinError
         A pipeline or model does not exist, two have the same name, or no condition can be applied to the frames.
     """
-    pipelines, runs = list(plan.pipelines), plan.models
+    pipelines, runs, rendered = list(plan.pipelines), plan.models, RenderedSource(plan.sensor, CONTACTS)
     check_pipelines(pipelines, tuple(each.name for each in runs))
-    settings = SweepSettings(RenderedSource(plan.sensor, CONTACTS), (), plan.sweep.cases(), plan.sweep.severities())
+    settings = SweepSettings(rendered, (), plan.sweep.cases(), plan.sweep.severities())
     if runs:
         from training.estimate.loading import digest_of
 
         load_models(runs, plan.sensor)  # each worker process loads its own; loading here reports an error once, before the work starts
         models, digests = partial(load_models, runs, plan.sensor), {each.name: digest_of(each) for each in runs}
         settings = replace(settings, models=models, model_digests=digests)
+    source, notes, beside = "rendered", list[str](), None
     if plan.frames is None:
-        return DegradationResult(*rendered_study(settings, pipelines, out, jobs=plan.jobs, progress=progress))
-    real = real_study(settings, pipelines, plan.frames, plan.limit, out, beside=plan.rendered, jobs=plan.jobs, progress=progress)
-    return DegradationResult(*real)
+        with stage(progress, "contacts, undegraded"):
+            frames = [shot.frame for shot in rendered.render(settings.cases[0], 0.0)]
+        with stage(progress, "tuning") as step:
+            settings = replace(settings, detectors=choose_pipelines(pipelines, plan.sensor, frames, out / "pipelines", step))
+    else:
+        settings, notes = real_settings(settings, pipelines, plan.frames, plan.limit, out / "pipelines", progress=progress)
+        source = plan.frames.name
+    with stage(progress, "conditions x steps") as step:
+        judged = evaluate_sweep(settings, out, jobs=plan.jobs, progress=step)
+    if plan.frames is not None and plan.rendered and settings.source.form == Form.RAW:
+        with stage(progress, "the same, rendered") as step:
+            beside = evaluate_sweep(replace(settings, source=rendered), out / "rendered", jobs=plan.jobs, progress=step)
+    return DegradationResult(judged.envelopes, write_report(out, judged, source=source, notes=notes, rendered=beside))
 
 
 def load_models(
     runs: tuple[Path, ...], sensor: SensorSpec, source: RenderedSource | RealSource | None = None
-) -> dict[str, Callable[[Frame], ModelAnswer]]:
-    """Models by name, as a sweep calls them. If a model was trained on recordings, raw frames are converted to that form first.
+) -> dict[str, "PoseEstimator"]:
+    """Models by name.
 
     Models that use a frame without contact take that of the ``source``; without one, its contacts determine the pins at rest.
     """
-    return {each.name: partial(_estimates, _at_rest(_load_estimator(each, sensor), source), sensor.recording) for each in runs}
+    return {each.name: _at_rest(_load_estimator(each, sensor), source) for each in runs}
 
 
 def _load_estimator(run: Path, sensor: SensorSpec) -> "PoseEstimator":
@@ -126,8 +136,3 @@ def _at_rest(estimator: "PoseEstimator", source: RenderedSource | RealSource | N
         return estimator.at_rest(in_form(rest, estimator.form, recording))
     assert isinstance(source, RealSource)
     return estimator.at_rest_of(in_form(frame, estimator.form, recording) for frame in source.frames)[0]
-
-
-def _estimates(estimator: "PoseEstimator", recording: RecordingSpec | None, frame: Frame) -> ModelAnswer:
-    found = estimator(in_form(frame, estimator.form, recording))
-    return ModelAnswer(found.value, found.low, found.high, found.units, estimator.label_range, found.valid)

@@ -17,24 +17,20 @@ from training.estimate.displacements import MOST_CONTACTS, OTHER_UNIT
 from training.estimate.estimator import PoseEstimate, PoseEstimator
 from training.runs.identity import changed_since, trained_before
 from training.runs.run_files import folder_of
+from training.studies.frame_maps import write_frame_maps
 from training.studies.judging import measure_changes, measure_errors, rows_to_evaluate, time_frames, write_evaluation
 from training.touch.contact_maps import compare_maps
 from training.touch.slip import CapView, compare_slip, name_drags, random_places, resample_path
-from twin.camera.projection import project_in_form
 from twin.errors import FrameError, format_count
 from twin.estimate import readable_labels
 from twin.frames import Recording, evenly_read, open_recording
 from twin.frames.folders import IMAGE_FOLDERS, references_in
-from twin.mechanics.skin_map import ContactMaps
 from twin.pins.batch import recording_reference
 from twin.progress import Progress, silent, stage
-from twin.report.contact_maps import SkinPicture, draw_contact_maps
 from twin.report.table import write_table
-from twin.store import output, write_npz, writes
-from twin.types import Frame, ReadableResult
+from twin.store import output, writes
+from twin.types import ReadableResult
 
-# Length, mm, of the vector by which the direction of a shear traction is projected into the frame.
-ARROW_MM = 1e-3
 # Choices of the rows to evaluate.
 ROWS = ("validation", "all")
 # Choices of the labels that count as truth.
@@ -287,26 +283,6 @@ class Predictions:
             yield "note: 'twin new' was unsure of the layout of this sensor's pins, which may be why: decide it, and train again"
         if not poses:
             raise FrameError(f"{self.recording.path}: none of {len(self.recording)} frames gave a pose ({reasons[0]}); give other frames")
-
-
-def write_frame_maps(folder: Path, estimator: PoseEstimator, frame: Frame, maps: ContactMaps) -> list[Path]:
-    """Write the contact maps of one frame: arrays as ``NAME.npz``, a picture as ``NAME.png``. NAME is the frame's name without suffix.
-
-    The arrays are ``nodes_mm`` (G, 3), ``nodes_px`` (G, 2) in the frame, ``area_mm2`` (G,), ``force_n`` (G, 3), ``pressure_mpa`` (G,),
-    ``traction_mpa`` (G, 3) and ``patch`` (G,), of the grid's nodes, and ``resultant_n`` (3,) and ``torque_z_nmm``.
-    """
-    spec, name = estimator.sensor, Path(frame.name).stem
-    along = maps.traction_mpa / np.maximum(np.linalg.norm(maps.traction_mpa, axis=1, keepdims=True), 1e-12)
-    nodes_px = project_in_form(spec, estimator.form, maps.nodes_mm)
-    ends_px = project_in_form(spec, estimator.form, maps.nodes_mm + ARROW_MM * along)
-    arrays = {key: getattr(maps, key) for key in ("nodes_mm", "area_mm2", "force_n", "pressure_mpa", "traction_mpa", "patch")}
-    totals = {"resultant_n": maps.resultant_n, "torque_z_nmm": np.array(maps.torque_z_nmm)}
-    write_npz(folder / f"{name}.npz", arrays | totals | {"nodes_px": nodes_px})
-    shear = np.linalg.norm(maps.traction_mpa, axis=1)
-    shown = SkinPicture(frame.image, nodes_px, ends_px, maps.nodes_mm, maps.pressure_mpa, shear, maps.least_mpa)
-    force = ", ".join(f"{axis} {value:.2f}" for axis, value in zip("xyz", maps.resultant_n, strict=True))
-    draw_contact_maps(folder / f"{name}.png", shown, f"{frame.name}: force {force} N")
-    return [folder / f"{name}.npz", folder / f"{name}.png"]
 
 
 def predict_frames(run: str | Path, frames: str | Path, *, maps: Path | None = None, sequence: bool = False) -> Predictions:

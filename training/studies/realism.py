@@ -2,6 +2,7 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,15 @@ import numpy as np
 
 from scenes import SensorSpec
 from training.data.two_sample import SMALL, TwoSample, accuracy_text, evaluate_classifiers, evaluate_halves
+from twin.camera.projection import lens_disc
 from twin.errors import OptionError, format_count
-from twin.evaluation.pictures.realism import run_realism
-from twin.progress import Progress, Step, silent
+from twin.evaluation.pictures import report
+from twin.evaluation.pictures.compare import fixed_residual, statistics
+from twin.evaluation.pictures.compare import pin_aligned as align_pins
+from twin.evaluation.pictures.compare import pose_aligned as align_poses
+from twin.evaluation.pictures.frames import FEW_LOST, read_real
+from twin.optics.relief import without as plain_of
+from twin.progress import Progress, Step, silent, stage
 from twin.store import writes
 from twin.types import Quality, ReadableResult
 
@@ -87,8 +94,10 @@ def compare_with_renders(
         Also render from the labels alone.
     limit : int, optional
         Most frames that are used; they are spread evenly over the folder.
-    fitted, without
-        As in ``run_realism``.
+    fitted : int
+        Limit with which ``calibrate_optics`` was run. The frames to which it fitted are omitted.
+    without : collection of str
+        Details that are not rendered (`twin.optics.relief.without`).
     quality : {"rasterised", "preview", "standard", "high"}
     test : bool
         Train the two-sample test (minutes).
@@ -106,27 +115,40 @@ def compare_with_renders(
     """
     if thorough and not test:
         raise OptionError("`thorough` adds to the two-sample test, but `two_sample=False` leaves it out; give one of them")
-    asked = (_thorough if thorough else _quick) if test else None
-    found = run_realism(
-        frames,
-        sensor,
-        out,
-        with_poses=pose_aligned,
-        limit=limit,
-        fitted=fitted,
-        without=without,
-        quality=quality,
-        test=asked,
-        progress=progress,
-    )
-    return Realism(*found)
+    spec = plain_of(sensor, without)
+    disc, bar = lens_disc(spec.view, spec.housing), partial(stage, progress)
+    with bar("read the real frames, find their pins") as step:
+        real = read_real(frames, spec, disc, limit=limit, fitted=fitted, lost=0.0 if pose_aligned else FEW_LOST, progress=step)
+    with bar("fit the skin to the pins, render") as step:
+        pairs = align_pins(spec, real.frames, disc, quality=quality, progress=step)
+    poses = align_poses(spec, real.frames, disc, quality=quality, bar=bar) if pose_aligned else None
+    with bar("measure caps, skin, noise, spectra") as step:
+        found = statistics(pairs, disc, spec.pipeline.raw.polarity, progress=step)
+    outcome: dict[str, TwoSample] = {}
+    if test and len(pairs) > 1:
+        with bar("train the two-sample test") as step:
+            outcome = _two_sample([pair.real.frame.image for pair in pairs], [pair.image for pair in pairs], disc.inside, thorough, step)
+    metrics = {
+        "sensor": spec.name,
+        "quality": quality,
+        "frames": len(pairs),
+        "fitted": fitted,
+        "without": sorted(without),
+        "refused": real.refused,
+        "disc": {"center_px": disc.center_px.tolist(), "radius_px": disc.radius_px},
+        "pin_aligned": report.image_summary(pairs),
+        "fixed_residual": fixed_residual(spec, pairs),
+        "statistics": report.statistics_summary(found),
+        "two_sample": {name: {"accuracy": told.accuracy, "low": told.low, "high": told.high} for name, told in outcome.items()},
+        "pose_aligned": poses and report.pose_summary(poses),
+    }
+    return Realism(metrics, report.write_results(out, spec, metrics, pairs, found, poses))
 
 
-def _quick(real: list[np.ndarray], rendered: list[np.ndarray], inside: np.ndarray, step: Step) -> dict[str, TwoSample]:
-    return evaluate_classifiers(real, rendered, inside, judges={"small": SMALL}, progress=step)
-
-
-def _thorough(real: list[np.ndarray], rendered: list[np.ndarray], inside: np.ndarray, step: Step) -> dict[str, TwoSample]:
+def _two_sample(real: list[np.ndarray], rendered: list[np.ndarray], inside: np.ndarray, thorough: bool, step: Step) -> dict[str, TwoSample]:
+    """The two-sample tests of real and rendered images, by the names of the classifiers."""
+    if not thorough:
+        return evaluate_classifiers(real, rendered, inside, judges={"small": SMALL}, progress=step)
     halves = evaluate_halves(real, inside, progress=step)
     return evaluate_classifiers(real, rendered, inside, progress=step) | {f"{name}, real halves": made for name, made in halves.items()}
 

@@ -294,6 +294,8 @@ def grasp(
     object_mm: Annotated[float, typer.Option(min=1, max=200, help="width of the object between the fingers")] = 40.0,
     safety: Limits = None,
     also: options.Also = None,
+    ros2: Ros2 = None,
+    dry_run: DryRun = False,
     *,
     progress: Progress,
 ) -> "Gripped":
@@ -305,7 +307,7 @@ def grasp(
     sensors. With --gripper, --left, --right and --arm the same loop runs on devices.
 
     A ZIP file of stable-baselines3 can contain code, which is run: give only one that you trust. At the end the arm is disabled, and the
-    gripper keeps its width.
+    gripper keeps its width. With --ros2 NAME the topics are those of the sensors NAME/left and NAME/right.
 
     \b
     Example:
@@ -323,7 +325,8 @@ def grasp(
 
     plan, decide = call(GripPlan, locals()), GraspPolicy(load_grasp_policy(policy), object_mm)
     with signals_as_ctrl_c():
-        return grip(plan, decide, out, steps=decide.steps, period_s=PERIOD_S, progress=progress)
+        gripped = grip(plan, decide, out, steps=decide.steps, period_s=PERIOD_S, progress=progress)
+    return gripped  # type: ignore[return-value]  # a dry run has nothing but its lines
 
 
 emulate = App(

@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 from matplotlib.figure import Figure
 
-from scenes import load_object, load_sensor
+from scenes import ObjectSpec, SensorSpec, load_object, load_sensor
 from twin.camera.projection import project, project_in_form
 from twin.frames.forms import form_named
 from twin.frames.images import write_image
@@ -64,17 +64,16 @@ NEXT = (
 class ContactResult:
     """One contact through the whole chain."""
 
-    sensor: str
-    object_name: str
+    sensor: SensorSpec
+    obj: ObjectSpec
     pose: ContactPose
     state: ContactState
     raw: RenderedFrame
     look: plots.ObservedFrame
     seconds: dict[str, float]
-    stiffness_factor: float
 
 
-def run_contact(simulator: Simulator, object_name: str, pose: ContactPose, form: Form, *, progress: Step = unheard) -> ContactResult:
+def run_contact(simulator: Simulator, obj: ObjectSpec, pose: ContactPose, form: Form, *, progress: Step = unheard) -> ContactResult:
     """Press, render, capture, detect, and build the graph, for one contact."""
     form, seconds = form_named(form), {}
 
@@ -84,12 +83,12 @@ def run_contact(simulator: Simulator, object_name: str, pose: ContactPose, form:
         seconds[stage] = perf_counter() - start
         return result
 
-    state = clock("press", lambda: simulator.press(load_object(object_name), pose, progress=progress))
+    state = clock("press", lambda: simulator.press(obj, pose, progress=progress))
     raw = clock("render", lambda: simulator.render(state))
     rendered = raw if form == Form.RAW else clock("capture", lambda: simulator.as_processed(raw, state))
     look = look_at(simulator, rendered)
     seconds["pins and graph"] = look.observation.ms["total"] / 1e3
-    return ContactResult(simulator.spec.name, object_name, pose, state, raw, look, seconds, simulator.spec.skin.stiffness_factor)
+    return ContactResult(simulator.spec, obj, pose, state, raw, look, seconds)
 
 
 @dataclass(frozen=True)
@@ -166,20 +165,18 @@ def run_demo(out: Path, *, progress: Progress = silent) -> Demo:
         start = perf_counter()
         with bar(f"{sensor}: press the {object_name}, render, detect") as step:
             simulator = simulators[sensor] = Simulator(load_sensor(sensor))
-            result = run_contact(simulator, object_name, pose, form, progress=step)
+            result = run_contact(simulator, load_object(object_name), pose, form, progress=step)
         seconds[f"{sensor} against {object_name}"] = perf_counter() - start
         with bar(f"{sensor}: pictures"):
             skin = pictures / f"{sensor}-{object_name}-skin.png"
-            notes.add(
-                draw_contact_skin(simulator.solver.mesh, simulator.spec.pins, result.state, build_field(load_object(object_name)), skin)
-            )
-            _add_contact(page, simulator, result, contact_pictures(pictures, result) | {"skin": skin})
+            notes.add(draw_contact_skin(simulator.solver.mesh, simulator.spec.pins, result.state, build_field(result.obj), skin))
+            add_contact(page, result, skin)
 
     motion_sensor = CONTACTS[0][0]
     start = perf_counter()
     with bar(f"{motion_sensor}: motions along Z, X and Y") as step:
         moved = report_each(MOTIONS, step)
-        looks = [(title, run_contact(simulators[motion_sensor], "plane", pose, Form.RAW).look) for title, pose in moved]
+        looks = [(title, run_contact(simulators[motion_sensor], load_object("plane"), pose, Form.RAW).look) for title, pose in moved]
         add_motions(page, write_chart(pictures / "motions.png", lambda: motion_figure(looks)))
     seconds["motions"] = perf_counter() - start
 
@@ -198,32 +195,6 @@ def run_demo(out: Path, *, progress: Progress = silent) -> Demo:
     return Demo(tables, [write_page(out / "index.html", page, machine, seconds), *sorted(pictures.iterdir())])
 
 
-def _add_contact(page: Page, simulator: Simulator, result: ContactResult, pictures: dict[str, Path]) -> None:
-    spec = simulator.spec
-    touched = result.state.contact_mm
-    contact_mm = touched.mean(axis=0) if len(touched) else np.array([0, 0, spec.skin.apex_mm])
-    contact_px = project_in_form(spec, result.look.frame.form, contact_mm[None])[0]
-    height, width = result.raw.frame.image.shape[:2]
-    title = f"{spec.name} against {result.object_name}"
-    page.section(title, f"{spec.description}. {load_object(result.object_name).description}, pressed in by {result.pose.indent_mm:g} mm.")
-    add_contact(page, title, pictures, f"{width} x {height} px", contact_figures(result, contact_px))
-
-
-def contact_pictures(folder: Path, result: ContactResult) -> dict[str, Path]:
-    """Write the pictures of one contact, except the picture of the skin."""
-    look, stem = result.look, f"{result.sensor}-{result.object_name}"
-    graph, rest = look.graphs()
-    written = {
-        "raw": write_image(folder / f"{stem}-frame.png", result.raw.frame.image),
-        "pins": write_chart(folder / f"{stem}-graph.png", lambda: _graph_figure(look)),
-        "areas": write_chart(folder / f"{stem}-areas.png", lambda: _areas_figure(look)),
-        "surfaces": write_chart(folder / f"{stem}-surfaces.png", lambda: plots.area_surface_figure(rest, graph)),
-    }
-    if look.frame.form == Form.PROCESSED:
-        written["recorded"] = write_image(folder / f"{stem}-recorded.png", look.frame.image)
-    return written
-
-
 def motion_figure(motions: list[tuple[str, plots.ObservedFrame]]) -> Figure:
     """Displacement (top) and area change (bottom) for each motion, as in the paper's figure 1(d)."""
     figure, axes = new_figure(len(motions), 2, panel_inch=4.2)
@@ -234,12 +205,13 @@ def motion_figure(motions: list[tuple[str, plots.ObservedFrame]]) -> Figure:
     return figure
 
 
-def contact_figures(result: ContactResult, contact_px: np.ndarray) -> list[tuple[str, str]]:
+def contact_figures(result: ContactResult) -> list[tuple[str, str]]:
     """Names and values of one contact's figures, as shown on the page."""
-    look, force = result.look, result.state.force_n
+    look, spec, force, touched = result.look, result.sensor, result.state.force_n, result.state.contact_mm
     observation = look.observation
-    ends = force_interval(force.tolist(), result.stiffness_factor)
-    grown = plots.area_change_at(look, contact_px, count=12)
+    ends = force_interval(force.tolist(), spec.skin.stiffness_factor)
+    contact_mm = touched.mean(axis=0) if len(touched) else np.array([0, 0, spec.skin.apex_mm])
+    grown = plots.area_change_at(look, project_in_form(spec, look.frame.form, contact_mm[None])[0], count=12)
     parts = ", ".join(number(float(part), decimals=2, signed=True) for part in force)
     return [
         ("pins found", f"{observation.found} of {len(observation.pins_px)}"),
@@ -270,37 +242,47 @@ def write_page(path: Path, page: Page, machine: str, seconds: dict[str, float]) 
     return page.write(path, embed=True)
 
 
-def add_contact(page: Page, title: str, at: Mapping[str, Path], raw_size: str, figures: list[tuple[str, str]]) -> None:
-    """Add the pictures from `contact_pictures`, and ``skin``, of a contact whose raw frame has a size, and its `contact_figures`."""
+def add_contact(page: Page, result: ContactResult, skin: Path) -> None:
+    """Add a section about a contact. Its pictures are written beside that of the skin."""
+    look, spec, folder, stem = result.look, result.sensor, skin.parent, f"{result.sensor.name}-{result.obj.name}"
+    title = f"{spec.name} against {result.obj.name}"
+    page.section(title, f"{spec.description}. {result.obj.description}, pressed in by {result.pose.indent_mm:g} mm.")
+    height, width = result.raw.frame.image.shape[:2]
+    raw = write_image(folder / f"{stem}-frame.png", result.raw.frame.image)
     shown = [
         PagePicture(
-            at["skin"], f"{title}: deformed skin in 3D", "The skin, cut open, coloured by its displacement, with pins and object.", "photo"
+            skin, f"{title}: deformed skin in 3D", "The skin, cut open, coloured by its displacement, with pins and object.", "photo"
         ),
-        PagePicture(at["raw"], f"{title}: rendered camera frame", f"What the camera inside sees ({raw_size}).", "frame"),
+        PagePicture(raw, f"{title}: rendered camera frame", f"What the camera inside sees ({width} x {height} px).", "frame"),
     ]
-    if "recorded" in at:
+    if look.frame.form == Form.PROCESSED:
+        recorded = write_image(folder / f"{stem}-recorded.png", look.frame.image)
         said = "The same frame in the form of this sensor's recordings: cropped, adaptively thresholded, resized."
-        shown.append(PagePicture(at["recorded"], f"{title}: frame in the form of a recording", said, "frame"))
+        shown.append(PagePicture(recorded, f"{title}: frame in the form of a recording", said, "frame"))
     page.figures(*shown, layout="row")
+    graph, rest = look.graphs()
     page.figures(
         PagePicture(
-            at["pins"],
+            write_chart(folder / f"{stem}-graph.png", lambda: _graph_figure(look)),
             f"{title}: pins and Voronoi graph",
             "Pins found (green), graph edges (blue) and Voronoi cells (white); yellow crosses are spots that are not pins.",
         ),
         PagePicture(
-            at["areas"], f"{title}: Voronoi area change", "Voronoi cell areas against no contact: cells grow where the dome flattens."
+            write_chart(folder / f"{stem}-areas.png", lambda: _areas_figure(look)),
+            f"{title}: Voronoi area change",
+            "Voronoi cell areas against no contact: cells grow where the dome flattens.",
         ),
         layout="row",
     )
     page.figures(
         PagePicture(
-            at["surfaces"],
+            write_chart(folder / f"{stem}-surfaces.png", lambda: plots.area_surface_figure(rest, graph)),
             f"{title}: interpolated area surfaces",
             "Cell area interpolated over the image: no contact, contact, difference.",
         )
     )
-    page.table([{"name": name, "value": value} for name, value in figures], [Column("name", "figure"), Column("value", "value")])
+    rows = [{"name": name, "value": value} for name, value in contact_figures(result)]
+    page.table(rows, [Column("name", "figure"), Column("value", "value")])
 
 
 def add_motions(page: Page, motions: Path) -> None:

@@ -3,6 +3,9 @@
 While a client of ``ur_rtde`` connects, it holds the interpreter's lock, for ever if the arm is silent, and it waits up to 300 s for a
 reply. A process can be ended. If the program that started it dies, it ends the arm's control program. Should it die too, the arm's own
 watchdog does that. The program imports the standard library and ``ur_rtde`` only, so that it starts soon.
+
+A client of ``ur_rtde`` that uploads the control program does that again, without a watchdog, whenever it has lost its link. Therefore ours
+is made without that option, and uploads the program by request only.
 """
 
 import contextlib
@@ -15,7 +18,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from typing import Any
 
@@ -23,8 +26,10 @@ from typing import Any
 WATCHDOG_HZ, KICK_S = 2.0, 0.1
 # Rate of the feedback: that of a CB3. Interval, s, at which a new packet is looked for.
 FEEDBACK_HZ, LOOK_S = 125.0, 0.001
-# Longest time, s, until the clients are connected, and until the control program runs.
-CONNECT_S = 3
+# Longest time, s, of a request, after which the process ends itself, and until the control program runs.
+CONNECT_S, START_S = 3, 2.5
+# The last of all answers. An answer is the number of its request, the value, and the error.
+LOST = (None, None, "")
 # What the feedback contains, as ``ur_rtde`` calls it.
 FIELDS = ("Timestamp", "ActualTCPPose", "ActualQ", "ActualQd", "TargetQd", "RobotMode", "SafetyMode", "RuntimeState", "TargetSpeedFraction")
 
@@ -46,11 +51,15 @@ class ClientProcess:
     def __init__(self, host: str) -> None:
         self.feedback: dict[str, Any] = {}
         self._answers: queue.Queue[Any] = queue.Queue()
-        self._lock = threading.Lock()
+        self._lock, self._asked = threading.Lock(), 0
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "start_new_session": True}
         self._process = subprocess.Popen([sys.executable, "-P", __file__, host, str(os.getpid())], **pipes)  # type: ignore[call-overload]
         threading.Thread(target=self._read, name="ur client", daemon=True).start()
-        self._answer(CONNECT_S)
+        try:
+            self._answer(CONNECT_S)
+        except BaseException:
+            self.end()
+            raise
 
     @property
     def is_alive(self) -> bool:
@@ -58,7 +67,7 @@ class ClientProcess:
         return bool(self._process.poll() is None)
 
     def ask(self, method: str, *arguments: Any, timeout_s: float) -> Any:
-        """What a method of the control program's client or of the dashboard's returns.
+        """What a method of the control program's client returns: ``connect`` makes this client, and ``enable`` uploads the program.
 
         Raises
         ------
@@ -68,8 +77,9 @@ class ClientProcess:
             The client refused.
         """
         with self._lock:
+            self._asked += 1
             with contextlib.suppress(OSError):  # its end is an answer, too
-                self._process.stdin.write(f"{json.dumps([method, *arguments])}\n".encode())
+                self._process.stdin.write(f"{json.dumps([self._asked, method, *arguments])}\n".encode())
                 self._process.stdin.flush()
             return self._answer(timeout_s)
 
@@ -79,17 +89,20 @@ class ClientProcess:
         self._process.wait()
 
     def _answer(self, timeout_s: float) -> Any:
-        try:
-            answer = self._answers.get(timeout=timeout_s)
-        except queue.Empty as error:
-            self.end()
-            raise ConnectionError(f"no answer within {timeout_s:g} s") from error
-        if answer is None:
-            self._answers.put(None)  # for all that ask later
-            raise ConnectionError("the connection is lost")
-        if isinstance(answer, str):
-            raise RuntimeError(answer)
-        return answer[0]
+        while True:
+            try:
+                number, value, error = self._answers.get(timeout=timeout_s)
+            except queue.Empty as late:
+                self.end()
+                raise ConnectionError(f"no answer within {timeout_s:g} s") from late
+            if number is None:
+                self._answers.put(LOST)  # for all that ask later
+                raise ConnectionError("the connection is lost")
+            if number < self._asked:  # the answer to a request whose wait was interrupted
+                continue
+            if error:
+                raise RuntimeError(error)
+            return value
 
     def _read(self) -> None:
         with contextlib.suppress(ValueError):  # a line that was cut short
@@ -99,7 +112,7 @@ class ClientProcess:
                     self.feedback = answer
                 else:
                     self._answers.put(answer)
-        self._answers.put(None)
+        self._answers.put(LOST)
 
 
 def run_clients(host: str, program: int) -> None:
@@ -115,29 +128,44 @@ def run_clients(host: str, program: int) -> None:
     def read() -> None:
         for line in sys.stdin:
             requests.put(json.loads(line))
-        requests.put([None])
+        requests.put([0, "end"])
 
     receive = import_module("rtde_receive").RTDEReceiveInterface(host, FEEDBACK_HZ)
-    dashboard = import_module("dashboard_client").DashboardClient(host)
-    dashboard.connect()
-    send([None])
+    send([0, None, ""])
     threading.Thread(target=read, daemon=True).start()
     threading.Thread(target=_send_feedback, args=(receive, send), daemon=True).start()
-    while receive.isConnected() and os.getppid() == program:  # the input does not end with a program that has forked
+    while os.getppid() == program:  # the input does not end with a program that has forked
         try:
-            method, *arguments = requests.get(timeout=KICK_S)
-            if method is None:  # the end of the input
-                break
-            if method == "enable":
-                control = _run_control_program(host, control)
-            send([method == "enable" or (getattr(control, method, None) or getattr(dashboard, method))(*arguments)])
+            number, method, *arguments = requests.get(timeout=KICK_S)
         except queue.Empty:
             if control is not None:
                 control.kickWatchdog()
-        except Exception as error:
-            send(str(error))
-    if control is not None and receive.isConnected():
-        control.stopScript()
+            continue
+        if method == "end":
+            break
+        with _limit_time():
+            try:
+                value = None
+                if method == "connect":
+                    control = control or _connect(host)
+                elif method == "enable":
+                    _run_program(control)
+                else:
+                    value = getattr(control, method)(*arguments)
+                send([number, value, ""])
+            except Exception as error:
+                send([number, None, str(error)])
+    if control is not None:
+        with _limit_time():
+            control.stopScript()
+
+
+@contextlib.contextmanager
+def _limit_time() -> Iterator[None]:
+    """Context that ends the process if it lasts too long: a silent arm never answers, and perhaps nobody is left to end it."""
+    faulthandler.dump_traceback_later(CONNECT_S, exit=True)
+    yield
+    faulthandler.cancel_dump_traceback_later()
 
 
 def _send_feedback(client: Any, send: Callable[[object], None]) -> None:
@@ -149,21 +177,25 @@ def _send_feedback(client: Any, send: Callable[[object], None]) -> None:
             continue
         send(packet | {"time_s": time.monotonic()})
         sent = packet["Timestamp"]
+    os._exit(0)  # at once, also during a request
 
 
-def _run_control_program(host: str, control: Any) -> Any:
-    """The client of the control program, which runs when this returns."""
-    faulthandler.dump_traceback_later(CONNECT_S, exit=True)  # with a silent arm it never returns, and perhaps nobody is left to end it
-    if control is None:
-        control = import_module("rtde_control").RTDEControlInterface(host)
-    else:
-        control.reuploadScript()
-        while not control.isProgramRunning():
-            time.sleep(LOOK_S)
+def _connect(host: str) -> Any:
+    """A client that uploads and awaits no program by itself."""
+    interface = import_module("rtde_control").RTDEControlInterface
+    return interface(host, flags=int(interface.FLAG_NO_WAIT))
+
+
+def _run_program(control: Any) -> None:
+    """Upload the control program, and set its watchdog when it runs."""
+    control.reuploadScript()
+    until_s = time.monotonic() + START_S
+    while not control.isProgramRunning():
+        if time.monotonic() > until_s:
+            raise RuntimeError(f"its control program does not run within {START_S:g} s, or ended at once")
+        time.sleep(LOOK_S)
     if not control.setWatchdog(WATCHDOG_HZ):
-        raise RuntimeError("its control program does not answer")
-    faulthandler.cancel_dump_traceback_later()
-    return control
+        raise RuntimeError("its control program does not answer, or ended at once")
 
 
 if __name__ == "__main__":

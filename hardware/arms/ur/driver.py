@@ -3,6 +3,8 @@
 import contextlib
 import importlib.util
 import logging
+import re
+import socket
 import time
 from collections.abc import Callable
 from typing import Any
@@ -31,6 +33,7 @@ SAFETY = {
     **dict.fromkeys((6, EMERGENCY), "emergency stop; release it at the robot"),
     **dict.fromkeys((8, 9), "safety violation or fault; restart the robot"),
 }
+DASHBOARD_PORT = 29999
 ENDED = "its control program was ended by its watchdog, by a limit, at the teach pendant or by another program; call enable()"
 # Longest waits, s: for power and brakes; for the release of a protective stop, which is possible after 5 s; for a reply; for the reply to
 # a stop, and until feedback shows that it stands; and for packets that have arrived while this program was stalled.
@@ -46,9 +49,9 @@ class UR(BaseArm):
     """A Universal Robots arm with PolyScope 3 or 5.
 
     Its pose is that of the arm's active TCP in the base frame. ``enable`` uploads the control program of ``ur_rtde``, which ends any other
-    program. ``disable`` ends it; then nothing moves the arm, and the motors hold it. ``emergency_stop`` switches them off. If this program
-    dies or the link is lost, a watchdog in the arm ends the control program. A link that was lost is opened by ``connect`` only. The speed
-    slider slows all moves; it is never changed, and logged.
+    program. ``disable`` ends it, as does an ``enable`` that fails; then nothing moves the arm, and the motors hold it. ``emergency_stop``
+    switches them off. If this program dies or the link is lost, a watchdog in the arm ends the control program. A link that was lost is
+    opened by ``connect`` only. The speed slider slows all moves; it is never changed, and logged.
 
     Parameters
     ----------
@@ -78,7 +81,8 @@ class UR(BaseArm):
             self._client = ClientProcess(self._host)
         try:
             self._require_shown(lambda packet: True, REPLY_S, "sends no feedback")
-            model = self._ask("getRobotModel").rstrip("e"), int(self._ask("polyscopeVersion")[0])
+            version = re.search(r"\d+", self._tell("PolyscopeVersion", REPLY_S))
+            model = self._tell("get robot model", REPLY_S).rstrip("e"), int(version[0] if version else 0)
             if model not in MODELS:
                 raise DeviceError(f"{self.name}: {model} is no known model and version of PolyScope: {sorted(MODELS)}")
             state, kinematics = self.state(), self.kinematics
@@ -99,19 +103,22 @@ class UR(BaseArm):
         packet = self._newest()
         if why := SAFETY.get(packet["SafetyMode"]):
             raise DeviceError(f"{self.name}: {why}")
-        for request, mode in (("powerOn", IDLE), ("brakeRelease", RUNNING)):
+        for request, mode in (("power on", IDLE), ("brake release", RUNNING)):
             if self._newest()["RobotMode"] < mode:
-                self._ask(request)
-                self._require_shown(lambda packet, mode=mode: packet["RobotMode"] >= mode, POWER_S, f"does not switch on ({request})")  # type: ignore[misc]
+                reply = self._tell(request, REPLY_S)
+                otherwise = f"does not switch on ({request}: {reply})"
+                self._require_shown(lambda packet, mode=mode: packet["RobotMode"] >= mode, POWER_S, otherwise)  # type: ignore[misc]
+        self._ask("connect", timeout_s=CONNECT_S)
         if not self._enabled or packet["RuntimeState"] != PLAYING:
-            self._ask("enable", timeout_s=CONNECT_S)
-        self._require_shown(lambda packet: packet["RuntimeState"] == PLAYING, REPLY_S, "its control program ended at once")
-        self._enabled = True
+            with self._watch_enabling():
+                self._enabled = True  # from now on the program may run, even if nothing is heard of it
+                self._ask("enable", timeout_s=CONNECT_S)
+                self._require_shown(lambda packet: packet["RuntimeState"] == PLAYING, REPLY_S, ENDED)
 
     def disable(self) -> None:
         self._require_in_use()
-        if self._enabled and self._client.feedback["RuntimeState"] != STOPPED:
-            self._halt("stop", lambda packet: packet["RuntimeState"] == STOPPED and not _moves(packet))
+        if self._enabled:
+            self._halt(lambda: self._tell("stop"), lambda packet: packet["RuntimeState"] == STOPPED and not _moves(packet))
         self._enabled = False
 
     def clear_error(self) -> None:
@@ -121,8 +128,8 @@ class UR(BaseArm):
         deadline = time.monotonic() + UNLOCK_S
         while (mode := self._newest()["SafetyMode"]) == PROTECTIVE and time.monotonic() < deadline:
             with contextlib.suppress(DeviceError):
-                self._ask("closeSafetyPopup")
-                self._ask("unlockProtectiveStop")
+                self._tell("close safety popup")
+                self._tell("unlock protective stop")
             self._shows(lambda packet: packet["SafetyMode"] != PROTECTIVE, STOP_S)
         if mode in SAFETY:
             raise DeviceError(f"{self.name}: {SAFETY[mode]}")
@@ -130,11 +137,11 @@ class UR(BaseArm):
     def stop(self) -> None:
         self._require_in_use()
         if self._enabled:
-            self._halt("stopL", lambda packet: not _moves(packet))
+            self._halt(lambda: self._ask("stopL", timeout_s=STOP_S), lambda packet: not _moves(packet))
 
     def emergency_stop(self) -> None:
         self._require_in_use()
-        self._halt("powerOff", lambda packet: packet["RobotMode"] < IDLE)
+        self._halt(lambda: self._tell("power off"), lambda packet: packet["RobotMode"] < IDLE)
         self._enabled = False
 
     def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState:
@@ -186,13 +193,16 @@ class UR(BaseArm):
         if not self._ask(method, target, float(min(speed, MOST_SPEED)), acceleration, True):
             raise DeviceError(f"{self.name}: {self.state().error or 'refused the move; look at its teach pendant'}")
 
-    def _halt(self, method: str, obeyed: Callable[[dict[str, Any]], bool]) -> None:
-        """Stop by a method of the clients, and see that the arm obeys."""
+    def _halt(self, act: Callable[[], object], obeyed: Callable[[dict[str, Any]], bool]) -> None:
+        """Stop, and see that the arm obeys. If it does not, its control program is ended, whether or not that can be seen."""
         self._unstopped = True
         try:
-            self._ask(method, timeout_s=STOP_S)
-            self._require_shown(obeyed, STOP_S, f"does not obey ({method})")
+            act()
+            if self._under_way or self.is_connected:  # otherwise it stood, and its controller has answered
+                self._require_shown(obeyed, STOP_S, "does not obey a stop")
         except DeviceError as error:
+            with contextlib.suppress(DeviceError):
+                self._tell("stop")
             watchdog = f"Without the link its watchdog stops it after {1 / WATCHDOG_HZ:g} s"
             raise type(error)(f"{self.name}: can't be stopped and may move. Press its emergency stop! {watchdog}. {error}") from error
         self._unstopped = self._under_way = False
@@ -202,6 +212,19 @@ class UR(BaseArm):
         refused = lambda error: DeviceError(f"{self.name}: {method}: {error}; look at its teach pendant, and at the cable")  # noqa: E731
         with ErrorsAs(ConnectionError, lost), ErrorsAs(RuntimeError, refused):
             return self._client.ask(method, *arguments, timeout_s=timeout_s)
+
+    def _tell(self, request: str, timeout_s: float = STOP_S) -> str:
+        """The dashboard's reply to a request. It has a connection of its own, so that it reaches an arm whose client hangs or has ended."""
+        lost = lambda error: DeviceNotConnectedError(f"{self.name}: {request}: no reply ({error}); check the cable, then call connect()")  # noqa: E731
+        at = self._host, DASHBOARD_PORT
+        with ErrorsAs(OSError, lost), socket.create_connection(at, timeout_s) as link, link.makefile("rw") as lines:
+            lines.readline()  # its greeting
+            lines.write(f"{request}\n")
+            lines.flush()
+            reply = lines.readline().strip()
+        if not reply or reply.lower().startswith(("failed", "could not")):
+            raise DeviceError(f"{self.name}: {request}: {reply or 'no reply'}; look at its teach pendant")
+        return reply
 
     def _newest(self, max_age_s: float = FEEDBACK_AGE_S) -> dict[str, Any]:
         asked_s = time.monotonic()
@@ -226,6 +249,7 @@ class UR(BaseArm):
 
     def _require_shown(self, obeyed: Callable[[dict[str, Any]], bool], within_s: float, otherwise: str) -> None:
         if not self._shows(obeyed, within_s):
+            self._newest()  # perhaps nothing was heard of it
             raise DeviceError(f"{self.name}: {otherwise}")
 
     def _require_in_use(self) -> None:
@@ -239,6 +263,8 @@ class UR(BaseArm):
     def _close(self) -> None:
         if self._client is not None:
             self._client.end()
+        if self._enabled:  # its program could not be ended, which its watchdog does, now that nothing is sent any more
+            time.sleep(1 / WATCHDOG_HZ)
         self._client = None
         self._enabled = self._under_way = self._unstopped = False
 

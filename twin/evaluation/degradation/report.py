@@ -1,7 +1,7 @@
 """The page, charts and tables of a sweep."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -52,9 +52,8 @@ def write_report(
     """
     (out / "plots").mkdir(exist_ok=True)
     plan, envelopes = evaluation.plan, evaluation.envelopes
-    cells, first = cells_of(plan), plan.detectors[0].name
-    entries = [_entry(out, case, evaluation, rendered, cells) for case in plan.cases]
-    entries.sort(key=lambda entry: entry.envelopes[first].width)
+    first = plan.detectors[0].name
+    of_first = sorted((e for e in envelopes if e.pipeline == first), key=lambda e: e.width)
     comparisons = [compare(envelopes, first, other.name) | {"nameless": other.method == "legacy"} for other in plan.detectors[1:]]
     shares = shares_of(envelopes, rendered.envelopes, first) if rendered else []
     written = [
@@ -85,8 +84,8 @@ def write_report(
     if shares:
         _shares_section(page, out, plan, shares)
     _limits_section(page, plan)
-    _envelope_section(page, plan, entries)
-    _cases_section(page, entries, first, beside_rendered=bool(shares))
+    _envelope_section(page, plan, envelopes, [e.case for e in of_first])
+    _cases_section(page, out, evaluation, of_first, rendered.curves if rendered else [])
     for path in written:
         page.download(path)
     return [page.write(out / "index.html"), *written]
@@ -134,24 +133,6 @@ def shares_figure(shares: Sequence[Share]) -> Figure:
     ax.set_xlim(0, 1.03)
     ax.set_xlabel("severity between held and failed. Bar: rendered frames; dot: real ones; arrow: no failure within the range", fontsize=8)
     return figure
-
-
-@dataclass(frozen=True)
-class _Entry:
-    """The content of the page about one case: envelopes by pipeline, chart, and the worst frame with its label."""
-
-    case: DegradedCase
-    envelopes: dict[str, Envelope]
-    plot: Path
-    picture: tuple[Path, str] | None
-
-
-def _entry(out: Path, case: DegradedCase, evaluation: SweepEvaluation, rendered: SweepEvaluation | None, cells: list[SweepCell]) -> _Entry:
-    own = {e.pipeline: e for e in evaluation.envelopes if e.case == case}
-    beside = rendered.curves if rendered else []
-    plot = write_chart(out / "plots" / f"{case.name}.png", lambda: case_figure(case, evaluation.curves, beside), dpi=CASE_DPI)
-    first = own[evaluation.plan.detectors[0].name]
-    return _Entry(case, own, plot, _worst(out, cells, case, first))
 
 
 def _pipelines_section(page: Page, plan: SweepSettings, comparisons: list[dict]) -> None:
@@ -239,7 +220,7 @@ def _limits_section(page: Page, plan: SweepSettings) -> None:
     page.table(rows, ["measure", "limit"])
 
 
-def _envelope_section(page: Page, plan: SweepSettings, entries: list[_Entry]) -> None:
+def _envelope_section(page: Page, plan: SweepSettings, envelopes: list[Envelope], cases: list[DegradedCase]) -> None:
     pipelines = [*(d.name for d in plan.detectors), *plan.model_digests]
     page.section(
         "Envelope, least margin first",
@@ -248,28 +229,32 @@ def _envelope_section(page: Page, plan: SweepSettings, entries: list[_Entry]) ->
         "that is held.",
     )
     rows = [
-        {"condition": Shown(e.case.title, href=link_to(e.case.name)), "parameter": _parameters(e.case)}
-        | {f"of {name}": Shown(v.label, note=TITLES.get(v.measure, ""), bar=v.width) for name, v in e.envelopes.items()}
-        for e in entries
+        {"condition": Shown(case.title, href=link_to(case.name)), "parameter": _parameters(case)}
+        | {f"of {e.pipeline}": Shown(e.label, note=TITLES.get(e.measure, ""), bar=e.width) for e in envelopes if e.case == case}
+        for case in cases
     ]
     page.table(rows, ["condition", "parameter", *(Column(f"of {name}", name) for name in pipelines)])
 
 
-def _cases_section(page: Page, entries: list[_Entry], first: str, *, beside_rendered: bool) -> None:
+def _cases_section(page: Page, out: Path, evaluation: SweepEvaluation, envelopes: list[Envelope], rendered: list[Curve]) -> None:
+    """Charts of all cases, with the worst frames under the first pipeline, whose ``envelopes`` are given."""
     page.section(
         "Condition by condition",
-        f"Mean over the frames with its 90 % interval; dotted: the limit{'; dashed: rendered frames' if beside_rendered else ''}. The "
-        f"picture is the worst frame of {first} just beyond its envelope: green circles are true pins that it found, red ones those it "
-        "missed, dots what it takes for pins.",
+        f"Mean over the frames with its 90 % interval; dotted: the limit{'; dashed: rendered frames' if rendered else ''}. The "
+        f"picture is the worst frame of {envelopes[0].pipeline} just beyond its envelope: green circles are true pins that it found, red "
+        "ones those it missed, dots what it takes for pins.",
     )
-    for entry in entries:
-        page.heading(entry.case.title, anchor=entry.case.name)
-        chart = PagePicture(entry.plot, f"Measures against {_parameters(entry.case)}")
-        if entry.picture is None:
+    cells = cells_of(evaluation.plan)
+    for envelope in envelopes:
+        case = envelope.case
+        page.heading(case.title, anchor=case.name)
+        plot = write_chart(out / "plots" / f"{case.name}.png", partial(case_figure, case, evaluation.curves, rendered), dpi=CASE_DPI)
+        chart, worst = PagePicture(plot, f"Measures against {_parameters(case)}"), _worst(out, cells, envelope)
+        if worst is None:
             page.figures(chart)
         else:
-            path, label = entry.picture
-            page.figures(PagePicture(path, f"Worst frame under {entry.case.title}", label, "frame"), chart, layout="beside")
+            path, label = worst
+            page.figures(PagePicture(path, f"Worst frame under {case.title}", label, "frame"), chart, layout="beside")
 
 
 def _parameters(case: DegradedCase) -> str:
@@ -288,8 +273,9 @@ def compare(envelopes: list[Envelope], ours: str, theirs: str) -> dict:
     return {"ours": ours, "theirs": theirs, "cases": len(pairs), "as_wide": len(wider), "twice": len(twice), "narrower": narrower}
 
 
-def _worst(out: Path, cells: list[SweepCell], case: DegradedCase, envelope: Envelope) -> tuple[Path, str] | None:
+def _worst(out: Path, cells: list[SweepCell], envelope: Envelope) -> tuple[Path, str] | None:
     """Picture and label of the worst frame at the first severity above the envelope, or at the last one."""
+    case = envelope.case
     own = [cell for cell in cells if cell.case == case]
     cell = next((c for c in own if c.severity >= envelope.severity and c.severity > 0), own[-1])
     path = out / "pictures" / f"{cell.file}.jpg"

@@ -1,4 +1,4 @@
-"""A complete robustness study on rendered or on real frames, with its results in one folder.
+"""The pipelines of a robustness study, and real frames for it.
 
 The true places of the pins in real frames are unknown. The places on which several detectors agree are used instead.
 """
@@ -12,9 +12,7 @@ import numpy as np
 from scenes.sensor import SensorSpec
 from twin.errors import ErrorsAs, FrameError, OptionError, TwinError
 from twin.evaluation.degradation.condition import DegradedCase
-from twin.evaluation.degradation.envelope import Envelope, evaluate_sweep
-from twin.evaluation.degradation.report import write_report
-from twin.evaluation.degradation.shots import RealSource, RenderedSource
+from twin.evaluation.degradation.shots import RealSource
 from twin.evaluation.degradation.sweep import SweepSettings
 from twin.frames import evenly_read, open_recording
 from twin.pins import METHODS, DetectorSpec, load_detector, make_detector, shipped_detector, write_detector
@@ -33,39 +31,22 @@ LEAST_AGREEING = 2
 """Number of detectors that must agree on a pin."""
 
 
-def rendered_study(
-    settings: SweepSettings, pipelines: list[str], out: Path, *, jobs: int = 1, progress: Progress = silent
-) -> tuple[list[Envelope], list[Path]]:
-    """A study on the rendered frames of ``settings``, whose detectors are those of ``pipelines``. Results are as of `study`."""
-    with stage(progress, "contacts, undegraded"):
-        frames = [shot.frame for shot in settings.source.render(settings.cases[0], 0.0)]
-    with stage(progress, "tuning") as step:
-        detectors = choose_pipelines(pipelines, settings.source.spec, frames, out / "pipelines", step)
-    return study(replace(settings, detectors=detectors), "rendered", out, jobs=jobs, progress=progress)
+def real_settings(
+    settings: SweepSettings, pipelines: list[str], path: Path, limit: int, folder: Path, *, progress: Progress = silent
+) -> tuple[SweepSettings, list[str]]:
+    """Settings for at most ``limit`` real frames at a path, and remarks. Only conditions that can be applied to these frames remain.
 
-
-def real_study(
-    settings: SweepSettings,
-    pipelines: list[str],
-    path: Path,
-    limit: int,
-    out: Path,
-    *,
-    beside: bool = True,
-    jobs: int = 1,
-    progress: Progress = silent,
-) -> tuple[list[Envelope], list[Path]]:
-    """A study on at most ``limit`` real frames of a folder, with the image-level conditions of ``settings`` only.
-
-    Results are as of `study`. With ``beside`` and raw frames, the rendered frames of ``settings`` are also swept, and the envelopes of both
-    are compared.
+    Raises
+    ------
+    TwinError
+        None of the conditions can be applied.
     """
     spec, cases = settings.source.spec, settings.cases
     recording = open_recording(path, spec)
     frames = evenly_read(recording, limit)
     with stage(progress, "tuning") as step:
-        detectors = choose_pipelines(pipelines, spec, frames, out / "pipelines", step)
-        judges = choose_pipelines(["twin", "adaptive"], spec, frames, out / "pipelines", step)
+        detectors = choose_pipelines(pipelines, spec, frames, folder, step)
+        judges = choose_pipelines(["twin", "adaptive"], spec, frames, folder, step)
     built_in = [each for each in detectors if each.method != OWN]  # what is evaluated must not say what is true
     source, notes = consensus(spec, frames, list(dict.fromkeys((*built_in, *judges))))
     notes += recording.notes()
@@ -74,45 +55,7 @@ def real_study(
         raise TwinError("none of the conditions can be applied to frames that are already there; without `frames` they are rendered")
     if left := [c.name for c in cases if c not in usable]:
         notes.append(f"left out, because they cannot be applied to frames that are already there: {', '.join(left)}")
-    source = replace(source, rest_frame=recording.reference)
-    plan = replace(settings, source=source, detectors=detectors, cases=usable)
-    rendered = settings.source if beside and recording.form == Form.RAW else None
-    return study(plan, path.name, out, jobs=jobs, notes=notes, rendered=rendered, progress=progress)
-
-
-def study(
-    plan: SweepSettings,
-    source: str,
-    out: Path,
-    *,
-    progress: Progress = silent,
-    jobs: int = 1,
-    notes: list[str] | None = None,
-    rendered: RenderedSource | RealSource | None = None,
-) -> tuple[list[Envelope], list[Path]]:
-    """Sweep, evaluate and write. Returns the envelopes and the written files, the page first.
-
-    Parameters
-    ----------
-    plan : SweepSettings
-    source : str
-        Name of the frames for the page.
-    out : Path
-    progress : Progress
-    jobs : int
-        Number of processes.
-    notes : list of str, optional
-        Remarks for the page.
-    rendered : RenderedSource, optional
-        Rendered frames of the same sensor. They are also swept (in ``out/rendered``), and the plan's frames are compared with them.
-    """
-    with stage(progress, "conditions x steps") as step:
-        judged = evaluate_sweep(plan, out, jobs=jobs, progress=step)
-    beside = None
-    if rendered is not None:
-        with stage(progress, "the same, rendered") as step:
-            beside = evaluate_sweep(replace(plan, source=rendered), out / "rendered", jobs=jobs, progress=step)
-    return judged.envelopes, write_report(out, judged, source=source, notes=notes or [], rendered=beside)
+    return replace(settings, source=replace(source, rest_frame=recording.reference), detectors=detectors, cases=usable), notes
 
 
 def check_pipelines(names: list[str], models: tuple[str, ...] = ()) -> None:

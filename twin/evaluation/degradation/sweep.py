@@ -1,20 +1,23 @@
 """Sweep: every case at every severity is a cell. Cells are computed in parallel and stored, and finished cells are not computed again."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
 
 from scenes import load_object
+from scenes.sensor import RecordingSpec
+from twin.camera.capture import in_form
+from twin.estimate import SensorModel
 from twin.evaluation.degradation.condition import Condition, DegradedCase
 from twin.evaluation.degradation.measures import measure_frame
 from twin.evaluation.degradation.shots import DegradedFrame, RealSource, RenderedSource
 from twin.pins import DetectorSpec, Found, make_detector
 from twin.store import Item, find_json, inputs_digest, keep_json, write_bytes
-from twin.types import Frame
 from twin.workers import in_processes
 
 SEVERITIES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
@@ -22,30 +25,15 @@ CELLS = "cells"
 """Name of the folder with the finished cells."""
 
 
-@dataclass(frozen=True)
-class ModelAnswer:
-    """A model's answer for a frame.
+class SweptModel(SensorModel, Protocol):
+    """A trained model that a sweep evaluates (``training.estimate.estimator.PoseEstimator``)."""
 
-    Attributes
-    ----------
-    value, low, high : (K,) float
-        The pose, and the ends of its 90 % intervals.
-    units : tuple of str
-        "mm" or "deg".
-    range : (K,) float
-        Extent of the labels that the model was trained on. An interval wider than a third of it says nothing.
-    valid : bool
-    """
-
-    value: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    units: tuple[str, ...]
-    range: np.ndarray
-    valid: bool
+    @property
+    def label_range(self) -> np.ndarray:
+        """Extent (K,) of the labels that the model was trained on. An interval wider than a third of it says nothing."""
 
 
-Models = Callable[[RenderedSource | RealSource], dict[str, Callable[[Frame], ModelAnswer]]]
+Models = Callable[[RenderedSource | RealSource], Mapping[str, SweptModel]]
 """Function that returns models of a source's sensor by their names; each process calls it once."""
 
 
@@ -130,26 +118,29 @@ def _begin(plan: SweepSettings, folder: Path) -> Callable[[SweepCell], None]:
     return partial(_run_cell, plan, folder, plan.models(plan.source) if plan.models else {})
 
 
-def _run_cell(plan: SweepSettings, folder: Path, models: dict[str, Callable[[Frame], ModelAnswer]], cell: SweepCell) -> None:
+def _run_cell(plan: SweepSettings, folder: Path, models: Mapping[str, SweptModel], cell: SweepCell) -> None:
     rows: list[dict] = []
     worst: tuple[float, DegradedFrame, Found] | None = None
     detectors = [make_detector(plan.source.spec, cell.case.on_setting(spec, cell.severity)) for spec in plan.detectors]
+    recording = plan.source.spec.recording
     for shot in plan.source.render(cell.case, cell.severity):
         for place, detector in enumerate(detectors):
             found = detector(shot.frame)
             rows.append({"pipeline": detector.spec.name, "frame": shot.name, "reason": found.reason} | measure_frame(detector, found, shot))
             if place == 0 and (worst is None or rows[-1]["recall"] < worst[0]):
                 worst = rows[-1]["recall"], shot, found
-        rows += [{"pipeline": name, "frame": shot.name, "pose": _pose(model, shot)} for name, model in models.items()]
+        rows += [{"pipeline": name, "frame": shot.name, "pose": _pose(model, shot, recording)} for name, model in models.items()]
     if worst is not None:
         picture = cv2.imencode(".jpg", overlay(worst[1], worst[2]))[1].tobytes()
         write_bytes(folder / "pictures" / f"{cell.file}.jpg", picture)
     keep_json(folder / CELLS, cell.item, rows)
 
 
-def _pose(estimate: Callable[[Frame], ModelAnswer], degraded: DegradedFrame) -> dict:
-    answer = estimate(degraded.frame)
-    numbers = {name: np.asarray(getattr(answer, name), float).tolist() for name in ("value", "low", "high", "range")}
+def _pose(model: SweptModel, degraded: DegradedFrame, recording: RecordingSpec | None) -> dict:
+    """A model's estimate for a frame. A raw frame is first recorded if the model was trained on recordings."""
+    answer = model(in_form(degraded.frame, model.form, recording))
+    numbers = {name: np.asarray(getattr(answer, name), float).tolist() for name in ("value", "low", "high")}
+    numbers["range"] = np.asarray(model.label_range, float).tolist()
     return {**numbers, "units": list(answer.units), "valid": bool(answer.valid), "touched": degraded.touched}
 
 

@@ -16,6 +16,7 @@ from twin.frames.images import write_image
 from twin.report.charts import sized_figure, write_chart
 from twin.report.page import Page, PagePicture
 from twin.report.table import Cell, Column, number, write_rows
+from twin.store import made_by, write_json
 
 NAMES = {
     "level": "cap level, gray",
@@ -85,8 +86,17 @@ def pose_summary(found: PoseAligned) -> dict:
     }
 
 
-def write_tables(out: Path, pairs: list[Pair], found: Statistics, poses: PoseAligned | None) -> list[Path]:
-    """Write CSV files: figures by frame, measures by radius, spectra, spots."""
+TABLES = {
+    "frames": "figures of each frame",
+    "radial": "measures by distance from the centre",
+    "spectrum": "radial power spectra",
+    "spots": "bright spots",
+}
+"""Tables (CSV files) and their contents."""
+
+
+def _table_rows(pairs: list[Pair], found: Statistics, poses: PoseAligned | None) -> list[list[dict]]:
+    """Rows of the ``TABLES``."""
     frames = [_frame_row(pair, "pins") for pair in pairs] + [_frame_row(pair, "pose") for pair in (poses.pairs if poses else [])]
     radial = [vars(row) | {"relative_difference": row.difference} for row in found.radial]
     spectrum = [
@@ -98,21 +108,12 @@ def write_tables(out: Path, pairs: list[Pair], found: Statistics, poses: PoseAli
         for kind, s in (("real", found.real_spots), ("rendered", found.rendered_spots))
         for (x, y), peak in zip(s.px, s.peak, strict=True)
     ]
-    tables = {"frames": frames, "radial": radial, "spectrum": spectrum, "spots": spots}
-    return [write_rows(out / f"{name}.csv", rows) for name, rows in tables.items() if rows]
+    return [frames, radial, spectrum, spots]
 
 
 def _frame_row(pair: Pair, alignment: str) -> dict:
     pins = {"pin_px": pair.remainder_px, "exact": pair.exact}
     return {"image_name": pair.real.frame.name, "alignment": alignment, **vars(pair.figures), **pins}
-
-
-def write_plots(folder: Path, found: Statistics) -> dict[str, Path]:
-    """Draw radial profiles and spectra. Returns the charts' paths by the keys ``radial`` and ``spectrum``."""
-    return {
-        "radial": write_chart(folder / "radial.png", lambda: _radial_figure(found)),
-        "spectrum": write_chart(folder / "spectrum.png", lambda: _spectrum_figure(found)),
-    }
 
 
 def _radial_figure(found: Statistics) -> Figure:
@@ -148,23 +149,26 @@ def image_columns(*, mark_best: bool = False) -> list[Column]:
     ]
 
 
-def write_page(
-    path: Path, spec: SensorSpec, metrics: dict, plots: dict[str, Path], pairs: list[dict], poses: list[dict], found: Statistics
-) -> Path:
-    """Write index.html, whose pictures are files beside it.
+def write_results(
+    out: Path, spec: SensorSpec, metrics: dict, pairs: list[Pair], found: Statistics, poses: PoseAligned | None
+) -> list[Path]:
+    """Write ``index.html`` with its pictures, ``metrics.json`` and the ``TABLES``, and return their paths, the page first.
 
     Parameters
     ----------
-    path : Path
+    out : Path
     spec : SensorSpec
     metrics : dict
         Content of metrics.json.
-    plots : dict of str to Path
-        As `write_plots` gives them.
-    pairs, poses : list of dict
-        Rows of `write_pictures`, pin-aligned and pose-aligned.
+    pairs : list of Pair
+        Pin-aligned pairs.
     found : Statistics
+    poses : PoseAligned, optional
+        Pose-aligned pairs.
     """
+    pictures = out / "pictures"
+    rows = write_pictures(pictures, pairs, "pins")
+    pose_rows = write_pictures(pictures, poses.pairs, "pose") if poses else []
     disc = metrics["disc"]
     center = ", ".join(number(v, decimals=1) for v in disc["center_px"])
     page = Page(
@@ -186,7 +190,7 @@ def write_page(
             f"On the caps and their edges the renders miss {number(fixed['levels'], decimals=1)} gray levels (rms), of whose power "
             f"{number(100 * fixed['share'], decimals=1)} % is a picture fixed to each cap, which a better relief could hold."
         )
-    _statistics_section(page, metrics["statistics"], plots, found)
+    _statistics_section(page, metrics["statistics"], pictures, found)
     if metrics["pose_aligned"]:
         error = metrics["pose_aligned"]["pin_error_px"]
         page.section(
@@ -197,17 +201,17 @@ def write_page(
         )
         _image_table(page, metrics["pose_aligned"]["test_images"])
     page.section("Frame by frame, pin-aligned")
-    _frame_figures(page, pairs, "skin misses the pins by")
-    if poses:
+    _frame_figures(page, rows, "skin misses the pins by")
+    if pose_rows:
         page.section("Frame by frame, pose-aligned")
-        _frame_figures(page, poses, "mean pin error")
-    page.download(path.with_name("metrics.json"), "all figures of this page")
-    page.download(path.with_name("frames.csv"), "figures of each frame")
-    page.download(path.with_name("radial.csv"), "measures by distance from the centre")
-    page.download(path.with_name("spectrum.csv"), "radial power spectra")
-    if metrics["statistics"]["spots"]["real"] or metrics["statistics"]["spots"]["rendered"]:
-        page.download(path.with_name("spots.csv"), "bright spots")
-    return page.write(path)
+        _frame_figures(page, pose_rows, "mean pin error")
+    written = [write_json(out / "metrics.json", metrics | {"made_by": made_by(__name__)})]
+    page.download(written[0], "all figures of this page")
+    for (name, what), table in zip(TABLES.items(), _table_rows(pairs, found, poses), strict=True):
+        if table:
+            written.append(write_rows(out / f"{name}.csv", table))
+            page.download(written[-1], what)
+    return [page.write(out / "index.html"), *written]
 
 
 def _image_table(page: Page, summary: dict) -> None:
@@ -237,14 +241,15 @@ def _detector_text(count: int, metrics: dict) -> str:
     )
 
 
-def _statistics_section(page: Page, summary: dict, plots: dict[str, Path], found: Statistics) -> None:
+def _statistics_section(page: Page, summary: dict, pictures: Path, found: Statistics) -> None:
     bins = [row for row in found.radial if row.measure == RADIAL_MEASURES[0]]
     page.section(
         "Statistics by distance from the disc's centre",
         f"Means over {len(bins)} bins with equally many caps. Target for cap level, diameter and edge width: within {100 * TARGET:.0f} % "
         "in each bin (green: met, red: missed).",
     )
-    page.figures(PagePicture(plots["radial"], "Six measures of caps against the distance from the disc's centre, real and rendered"))
+    radial = write_chart(pictures / "radial.png", lambda: _radial_figure(found))
+    page.figures(PagePicture(radial, "Six measures of caps against the distance from the disc's centre, real and rendered"))
     columns = [Column(f"bin_{k}", f"{row.inner_px:.0f} to {row.outer_px:.0f}", "px", decimals=1, signed=True) for k, row in enumerate(bins)]
     rows = []
     for measure in RADIAL_MEASURES:
@@ -262,7 +267,8 @@ def _statistics_section(page: Page, summary: dict, plots: dict[str, Path], found
         f"counterpart{'' if away is None else f', {number(away, decimals=2)} px away in the median'}. The radial power spectra differ by "
         f"{number(summary['spectrum_db'], decimals=2)} dB (rms over log frequency)."
     )
-    page.figures(PagePicture(plots["spectrum"], "Radial power spectra of real and rendered frames", width_px=760))
+    spectrum = write_chart(pictures / "spectrum.png", lambda: _spectrum_figure(found))
+    page.figures(PagePicture(spectrum, "Radial power spectra of real and rendered frames", width_px=760))
 
 
 def _difference(row: RadialRow) -> Cell:

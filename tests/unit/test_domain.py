@@ -102,6 +102,26 @@ def test_intervals_grow_with_the_distance_and_never_shrink_until_there_is_no_est
     assert factors == sorted(factors) and factors[-1] > 1.2 and all(each.reason for each in verdicts[first:])
 
 
+def test_intervals_grow_from_where_the_frames_end_that_determined_them():
+    """A domain of two kinds of contact has the limits of the wider kind. The intervals may come from the other one."""
+    (narrow, labels), (wide, more) = contacts(600, 20), contacts(600, 21)
+    ridge = np.random.default_rng(22).uniform(-1, 1, (600, 1, 1)) * np.sin(2 * PLACES[:, ::-1])
+    pool = np.concatenate([narrow, wide + 0.06 * ridge + np.random.default_rng(23).normal(0, 0.02, wide.shape)])
+    both = learn_domain(pool, np.concatenate([labels, more]), REFERENCE, UNITS, least=np.array([0.05, 0.5]))
+    left_out, new = contacts(600, 24)[0], contacts(400, 25)[0]
+    dent = np.exp(-0.5 * ((PLACES - [2.0, 1.0]) ** 2).sum(axis=1))[:, None] * [0.12, 0.0]
+
+    def judge(domain, moved):
+        return [domain.assess(each, NONE_LOST, REFERENCE) for each in moved]
+
+    pooled, started = judge(both, new + dent), judge(both.starting_at(left_out, np.zeros(left_out.shape[:2], bool)), new + dent)
+    assert np.mean([not each.reason and not each.notes for each in pooled]) > 0.5  # the domain alone takes the dent for a contact
+    assert np.mean([each.reason != "" or each.factor > 1.5 for each in started]) > 0.9
+    assert [each.reason for each in started] == [each.reason for each in pooled]
+    usual = judge(both.starting_at(left_out, np.zeros(left_out.shape[:2], bool)), new)
+    assert np.mean([bool(each.notes) for each in usual]) <= np.mean([bool(each.notes) for each in judge(both, new)]) + 0.01
+
+
 def test_lighter_contacts_are_no_strangers_and_their_intervals_reach_no_contact():
     deep, labels = contacts(600, 7, depth=(1.0, 3.0))
     light = contacts(50, 8, depth=(0.0, 0.9))[0]
@@ -129,6 +149,7 @@ def test_an_estimate_far_outside_the_trained_range_is_named():
 def test_a_written_domain_judges_alike_and_one_of_other_pins_is_refused(tmp_path):
     write_domain(tmp_path / "domain.safetensors", domain())
     again = read_domain(tmp_path / "domain.safetensors", len(PLACES), 2)
+    assert np.array_equal(again.starts, np.ones(5))
     for each in contacts(20, 10)[0]:
         assert again(each).parts == pytest.approx(domain()(each).parts, abs=0.05)
     with pytest.raises(TrainingError, match="domain"):

@@ -3,6 +3,8 @@
 They come from the training fifths of the recordings (``TACTIP_REAL``) and from simulated contacts with sixteen objects, which are generated
 into FOLDER, or taken up from it (about two hours on two cores). Names: mg400-331, mg400-127, ur5-331, ur5-tacpad,
 edge, plate.
+
+``python tests/weights/domains.py --starts [NAME...]``: only measure again from where on the intervals grow, on the other fifths.
 """
 
 import os
@@ -16,7 +18,7 @@ from scenes.experiment import ExperimentSpec
 from training.data.dataset import Dataset, load_dataset, split_rows
 from training.data.simulated import config_of
 from training.estimate.contact_estimator import ContactEstimator, contacts_folder
-from training.estimate.domain import learn_domain, write_domain
+from training.estimate.domain import Domain, learn_domain, read_domain, write_domain
 from training.estimate.estimator import PoseEstimator
 from training.generation import GenerationConfig, generate
 from training.models.part import LIKELY
@@ -84,13 +86,41 @@ def moved(data: Dataset, rows: np.ndarray) -> np.ndarray:
     return (data.pins.nodes_px[rows] - data.pins.reference.pins_px) / data.pins.reference.spacing_px.mean()
 
 
-def make(name: str, folder: Path) -> Path:
-    """Learn the domain of some weights and write it; its path."""
+def weights_of(name: str) -> tuple[PoseEstimator, Path]:
+    """Some weights, and the path of their domain."""
     kinds = name in ("edge", "plate")
     place = contacts_folder("ur5-331") if kinds else SHIPPED / name
-    path = (place / name if kinds else place) / DOMAIN
-    estimator = ContactEstimator.load(place).parts[name] if kinds else PoseEstimator.load(name)
-    recorded = [load_dataset(REAL / each, estimator.sensor, estimator.names).in_order() for each in RECORDINGS[name]]
+    return ContactEstimator.load(place).parts[name] if kinds else PoseEstimator.load(name), (place / name if kinds else place) / DOMAIN
+
+
+def recordings_of(name: str, estimator: PoseEstimator) -> list[Dataset]:
+    return [load_dataset(REAL / each, estimator.sensor, estimator.names).in_order() for each in RECORDINGS[name]]
+
+
+def started(domain: Domain, estimator: PoseEstimator, recorded: list[Dataset]) -> Domain:
+    """The domain whose intervals grow from where the held-out frames of the recordings end, from which the intervals come."""
+    held = [(data, split_rows(len(data), 0)[1]) for data in recorded if data.pins.form == estimator.form]
+    if not held:
+        return domain
+    return domain.starting_at(
+        np.concatenate([moved(data, rows) for data, rows in held]), np.concatenate([data.pins.lost[rows] for data, rows in held])
+    )
+
+
+def start_again(name: str) -> None:
+    """Measure for the domain of some weights from where on the intervals grow."""
+    estimator, path = weights_of(name)
+    known = read_domain(path, estimator.sensor.pins.count, len(estimator.names))
+    domain = started(known, estimator, recordings_of(name, estimator))
+    path.unlink()
+    write_domain(path, domain)
+    print(f"{name}: intervals grow from {np.round(domain.starts, 2)} limits", flush=True)
+
+
+def make(name: str, folder: Path) -> Path:
+    """Learn the domain of some weights and write it; its path."""
+    estimator, path = weights_of(name)
+    recorded = recordings_of(name, estimator)
     least_of = [
         estimator.predict_rows(data, np.arange(0, len(data), 7)).half_width for data in recorded if data.pins.form == estimator.form
     ]
@@ -119,12 +149,17 @@ def make(name: str, folder: Path) -> Path:
         lost=recorded[0].pins.lost if whole else None,
         group=np.concatenate(group),
     )
+    domain = domain if whole else started(domain, estimator, recorded)
     write_domain(path, domain)
     print(f"{name}: {sum(map(len, pins))} frames, limits {np.round(domain.limits, 4)}, {path.stat().st_size} bytes", flush=True)
     return path
 
 
 if __name__ == "__main__":
+    if sys.argv[1] == "--starts":
+        for chosen in sys.argv[2:] or ("mg400-331", "mg400-127"):
+            start_again(chosen)
+        sys.exit()
     for old in SHIPPED.rglob(DOMAIN):  # those of an earlier version can't be read
         if old.parent.name in (sys.argv[2:] or RECORDINGS):
             old.unlink()

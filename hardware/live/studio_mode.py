@@ -185,7 +185,11 @@ class CameraFeed:
         Text for ``open_camera``.
     arm : str
         Text for ``open_arm``; "" for none.
-    model : SensorModel
+    sensor : SensorSpec
+    model : SensorModel or None
+        Without one only the pins are found.
+    lacking : str
+        Why there is no model.
 
     Raises
     ------
@@ -193,10 +197,11 @@ class CameraFeed:
         There is no such camera or arm, or the frames are not the model's.
     """
 
-    def __init__(self, camera: str, arm: str, model: SensorModel) -> None:
-        self.model = model = model.seeking_rest()
-        self._source = open_camera(camera, model.sensor, model.form)
-        model.check(model.sensor, self._source.form)
+    def __init__(self, camera: str, arm: str, sensor: SensorSpec, model: SensorModel | None, lacking: str = "") -> None:
+        self._source = open_camera(camera, sensor, None if model is None else model.form)
+        model = PinsAlone(sensor, self._source.form, lacking) if model is None else model.seeking_rest()
+        model.check(sensor, self._source.form)
+        self.model = model
         self.robot = WatchedArm(arm, self._source, model.pipeline) if arm else None
         self.name = self._source.name + (f" and {self.robot.name}" if self.robot else "")
         self._session = LiveSession(self._source, model)
@@ -351,12 +356,10 @@ class LiveMode(PageMode):
             self.disconnect()
             if not self._camera.value.strip():
                 raise TwinError("give a camera first: a number, /dev/videoN, http://..., a folder or a video")
-            model, sensor = self._twin.contact.model, self._twin.contact.setup.sensor
-            if model is None:
-                if self._twin.model_note == MODEL_LOADING:
-                    raise TwinError(f"{MODEL_LOADING}; press 'Connect' again in a moment")
-                model = PinsAlone(sensor, open_camera(self._camera.value.strip(), sensor).form, self._twin.model_note)
-            feed = CameraFeed(self._camera.value.strip(), self._arm.value.strip(), model)
+            contact, lacking = self._twin.contact, self._twin.model_note
+            if contact.model is None and lacking == MODEL_LOADING:
+                raise TwinError(f"{MODEL_LOADING}; press 'Connect' again in a moment")
+            feed = CameraFeed(self._camera.value.strip(), self._arm.value.strip(), contact.setup.sensor, contact.model, lacking)
             self._pipeline = Pipeline(feed.model.sensor, feed.model.form, feed.model.pipeline.reference)
             self._feed = feed
             feed.start(self._shots.give, self.complain)

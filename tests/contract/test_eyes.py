@@ -236,7 +236,7 @@ def studio_arm(monkeypatch):
 
     def start(source):
         monkeypatch.setattr("hardware.live.studio_mode.open_camera", lambda *_: source)
-        feeds.append(CameraFeed("any", "simulated", StudioModel()))
+        feeds.append(CameraFeed("any", "simulated", StudioModel.sensor, StudioModel()))
         feeds[0].start(lambda shot: None, lambda why: None)
         return feeds[0].robot
 

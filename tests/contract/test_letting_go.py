@@ -229,7 +229,7 @@ def feed(monkeypatch):
     monkeypatch.setattr("hardware.live.studio_mode.open_camera", lambda *_: shows(AT_REST))
     offset = free_offset()
     with Mg400Emulator(port_offset=offset) as emulator:
-        made = CameraFeed("any", f"mg400:127.0.0.1:{29999 + offset}", StudioModel())
+        made = CameraFeed("any", f"mg400:127.0.0.1:{29999 + offset}", StudioModel.sensor, StudioModel())
         ends, shots = [], []
         made.start(shots.append, ends.append)
         made.robot.arm()

@@ -287,13 +287,18 @@ def test_a_recording_is_shown_with_labels_doubts_and_the_twins_picture(client, t
     client.set("mode", "Twin")
 
 
+def connect_live(client, folder, arm):
+    """Connect the mode Live to the frames of a folder, and to an arm."""
+    client.set("mode", "Live")
+    client.set("camera", str(folder))
+    client.set("arm", arm)
+    client.set("Connect", True)
+
+
 def test_live_shows_a_source_and_an_arm_that_is_read_only(studio, client, tmp_path):
     folder = write_recording(tmp_path / "recording", load_sensor(SENSOR), 3)
     until(lambda: studio.modes[3]._twin.contact.model is not None)
-    client.set("mode", "Live")
-    client.set("camera", str(folder))
-    client.set("arm", "simulated")
-    client.set("Connect", True)
+    connect_live(client, folder, "simulated")
     html = wait_html(client, "arm: read only")
     assert "tool within x 150 to 450" in html
     robot = studio.modes[3]._feed.robot
@@ -318,10 +323,7 @@ def test_live_shows_the_pins_of_a_sensor_without_a_model(studio, client, tmp_pat
     until(lambda: contact.model is not None)
     model, contact.model = contact.model, None
     try:
-        client.set("mode", "Live")
-        client.set("camera", str(folder))
-        client.set("arm", "")
-        client.set("Connect", True)
+        connect_live(client, folder, "")
         html = wait_html(client, "pins found: 127 of 127")
         assert "No estimate: there is no model of this sensor" in html
         client.set("Disconnect", True)

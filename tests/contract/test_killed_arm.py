@@ -48,3 +48,15 @@ def test_killed_at_a_random_moment(kind, seed):
 @pytest.mark.parametrize("kind", ["mg400", "mg400-old", "magician", "ur"])
 def test_killed_at_many_random_moments(kind, seed):
     survive(kind, seed)
+
+
+@pytest.mark.parametrize("kind", ["mg400", "mg400-old"])
+def test_killed_while_it_is_enabled(kind, monkeypatch):
+    with bench(kind, time_scale=1.0) as at:
+        at.arm.connect()
+        monkeypatch.setattr(at.arm, "_await_mode", lambda *_: at.device.kill() or at.arm._ask("RobotMode()"))
+        with pytest.raises(DeviceError) as raised:
+            at.arm.enable()
+        assert "Press its emergency stop" in str(raised.value)
+        at.arm.disconnect()  # says nothing more
+        assert not at.arm.is_connected

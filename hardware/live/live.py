@@ -314,7 +314,7 @@ class WatchResult:
         lines += self.timing.lines()
         if self.frames:
             why = "" if self.valid == self.frames or not self.invalid else f"; the last invalid one: {self.invalid}"
-            lines.append(f"{self.valid} of {self.frames} frames valid{why}")
+            lines.append(f"{self.valid} of {format_count(self.frames, 'frames')} valid{why}")
         if self.same is not None:
             lines.append(f"{self.same[0]} of {self.same[1]} estimates equal the recorded ones")
         if self.record is not None:

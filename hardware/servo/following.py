@@ -447,7 +447,7 @@ def study_servo(plan: ServoStudyPlan, out: Path, *, progress: Progress = silent)
             progress("objects followed", len(found), len(plan.models) * len(plan.objects))
     reasons = [said for said in found.values() if isinstance(said, str)]
     if reasons and len(reasons) == len(found):
-        raise TwinError(f"none of {len(found)} runs made a step; the first: {reasons[0]}")
+        raise TwinError(f"none of {format_count(len(found), 'runs')} made a step; the first: {reasons[0]}")
     made = ServoStudy(found, [])
     made.written.append(write_rows(out / "study.csv", made.rows))
     pictures = [(*key, run.path, run.outline_mm) for key, run in found.items() if isinstance(run, Followed)]

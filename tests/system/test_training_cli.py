@@ -194,7 +194,7 @@ def test_mistakes_are_named(recording, run, tmp_path):
         twin("train", "--model", "vgnn", "--target", "pose_9", *common)
     blank = tmp_path / "blank.png"
     cv2.imwrite(str(blank), np.zeros((256, 256), np.uint8))
-    with pytest.raises(FrameError, match=r"blank\.png: none of 1 frames gave a pose"):
+    with pytest.raises(FrameError, match=r"blank\.png: none of 1 frame gave a pose"):
         twin("predict", run, blank)
     with pytest.raises(TrainingError, match="no trained model"):
         twin("predict", tmp_path, recording / "frames_bw" / "f_3.png")

@@ -134,7 +134,7 @@ def test_a_tuning_survives_its_file(tuned, tmp_path):
 
 def test_frames_without_a_layout_are_refused(spec):
     black = Frame(np.zeros((480, 640), np.uint8), Form.RAW)
-    with pytest.raises(FrameError, match="none of 1 frames shows 127 pins"):
+    with pytest.raises(FrameError, match="none of 1 frame shows 127 pins"):
         tune([black], spec)
 
 

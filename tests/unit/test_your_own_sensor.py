@@ -281,7 +281,7 @@ def test_a_refused_estimate_of_a_sensor_whose_layout_is_unsure_points_at_the_lay
         description = f"{sensor.description} {UNSURE_LAYOUT}" if unsure else sensor.description
         predictions.estimator.sensor = sensor.model_copy(update={"description": description})
         said = []
-        with pytest.raises(FrameError, match="none of 1 frames gave a pose"):
+        with pytest.raises(FrameError, match="none of 1 frame gave a pose"):
             for line in predictions.lines():
                 said.append(line)
         assert any("unsure of the layout" in line for line in said) == unsure

@@ -118,8 +118,8 @@ def _solve(
                 failed.append(number)
                 if len(failed) > found + MOST_FAILED:
                     raise TwinError(
-                        f"the expert of {plan.task} solved {found} of {found + len(failed)} episodes; give other objects or another "
-                        "randomisation, or improve the task's expert"
+                        f"the expert of {plan.task} solved {found} of {format_count(found + len(failed), 'episodes')}; give other objects "
+                        "or another randomisation, or improve the task's expert"
                     )
                 continue
             assert batch.eye is not None  # it makes pictures

@@ -4,6 +4,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from scenes.sensor import SensorSpec
+from twin.errors import format_count
 from twin.pins.check import Finding, Grade
 from twin.types import Frame
 
@@ -53,7 +54,7 @@ def contact_finding(frames: list[Frame], sensor: SensorSpec, run: Path | None = 
             assessed += 1
             strange += [] if made.valid else [f"{frame.name}: {made.reason}"]
     share = len(strange) / max(assessed, 1)
-    text = f"{assessed - len(strange)} of {assessed} frames with pins are contacts that the weights of {sensor.name} know"
+    text = f"{assessed - len(strange)} of {format_count(assessed, 'frames')} with pins are contacts that the weights of {sensor.name} know"
     if not strange:
         return Finding("contacts", Grade.HEALTHY, share, text, "")
     verdict = Grade.FAILED if share > MOST_STRANGE else Grade.DEGRADED

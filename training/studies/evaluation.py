@@ -282,7 +282,8 @@ class Predictions:
         if reasons and UNSURE_LAYOUT in self.estimator.sensor.description:
             yield "note: 'twin new' was unsure of the layout of this sensor's pins, which may be why: decide it, and train again"
         if not poses:
-            raise FrameError(f"{self.recording.path}: none of {len(self.recording)} frames gave a pose ({reasons[0]}); give other frames")
+            given = format_count(len(self.recording), "frames")
+            raise FrameError(f"{self.recording.path}: none of {given} gave a pose ({reasons[0]}); give other frames")
 
 
 def predict_frames(run: str | Path, frames: str | Path, *, maps: Path | None = None, sequence: bool = False) -> Predictions:

@@ -297,7 +297,8 @@ def _compare_layout(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
             if alone
             else "give each pin's place, `layout` positions:FILE.csv"
         )
-        raise FrameError(f"none of {len(images)} frames shows {layout.in_words()}{instead}; leave `layout` out to identify it, or {places}")
+        given = format_count(len(images), "frames")
+        raise FrameError(f"none of {given} shows {layout.in_words()}{instead}; leave `layout` out to identify it, or {places}")
     doubt = f"{layout.in_words()} were given, but explain only {100 * shown.explained:.1f} % of the spots: {shown.differences()}"
     if other is None or other.explained <= shown.explained:
         return Identified((shown,), False, (f"{doubt}; check in the overlay whether these are all pins",), 0.0, polarity)

@@ -108,7 +108,7 @@ def open_video(path: Path) -> Video:
     step_s = np.median(np.diff(times_s)) if count > 1 else 0.0
     if (promised > count and times_s[-1] + 1.5 * step_s < lasts_s) or is_cut(path):
         # The decoder fills the missing part of a truncated frame with a guess, without a message.
-        decoded = f"{count} of {max(promised, count)} frames can be decoded"
+        decoded = f"{count} of {format_count(max(promised, count), 'frames')} can be decoded"
         problems.append(f"cut, {decoded}; the last of them may lack a part and is left out")
         count -= 1
     if min(sizes) >= count:
@@ -119,8 +119,9 @@ def open_video(path: Path) -> Video:
     others = {index: size for index, size in sizes.items() if size != usable[0][0]}
     faults = {index: f"another size ({times(size)}) than the others" for index, size in others.items()} | said
     faults = {index: fault for index, fault in faults.items() if index < count}
-    problems += [f"{n} of {count} frames are left out: {fault}" for fault, n in Counter(faults.values()).most_common(MOST_SAID)]
-    problems += [f"{repeated} of {count} frames repeat the one before them"] if repeated else []
+    given = format_count(count, "frames")
+    problems += [f"{n} of {given} are left out: {fault}" for fault, n in Counter(faults.values()).most_common(MOST_SAID)]
+    problems += [f"{repeated} of {given} repeat the one before them"] if repeated else []
     problems += filter(None, [describe_pauses(times_s)])
     return Video(path, count, firsts[usable[0][0]], [f"{path.name}: {problem}" for problem in problems], faults)
 

@@ -311,6 +311,6 @@ def _describe_no_result(path: str | Path, summary: dict, summary_path: Path) -> 
     """The message for a recording without a valid frame."""
     bad = summary["invalid"] + summary["failed"]
     return (
-        f"{path}: the pins were found in none of {len(bad)} frames; the first, {bad[0]['image_name']}: {bad[0]['reason']}; "
-        f"check `sensor`, `form` and the [pipeline] section of the specification (details in {summary_path})"
+        f"{path}: the pins were found in none of {format_count(len(bad), 'frames')}; the first, {bad[0]['image_name']}: {bad[0]['reason']}"
+        f"; check `sensor`, `form` and the [pipeline] section of the specification (details in {summary_path})"
     )

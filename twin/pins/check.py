@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from scenes.sensor import Polarity, SensorSpec, UsualCapsSpec
 from twin.camera.capture import expose
+from twin.errors import format_count
 from twin.frames import spread_indices
 from twin.frames.forms import blob_spec, gray_levels, known_sizes, pin_levels
 from twin.optics.preview import Preview
@@ -236,7 +237,7 @@ def _pins(frames: list[Frame], seen: list[Observation], pipeline: Pipeline) -> F
     share = float(lost.sum() / max(in_view.sum(), 1))
     steady = np.flatnonzero(lost.mean(axis=0) >= STEADY)
     outside = int(np.median((~in_view).sum(axis=1)))
-    text = f"{100 * share:.2f} % of the pins in view lost; {sum(o.valid for o in seen)} of {len(seen)} frames are valid"
+    text = f"{100 * share:.2f} % of the pins in view lost; {sum(o.valid for o in seen)} of {format_count(len(seen), 'frames')} are valid"
     bad = [f.name or f"number {k}" for k, (f, o) in enumerate(zip(frames, seen, strict=True), 1) if not o.valid]
     if 0 < len(bad) < len(seen):
         text += f"; not {', '.join(bad[:LISTED])}{', ...' if len(bad) > LISTED else ''}"

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.errors import ErrorsAs, FrameError, OptionError, TwinError
+from twin.errors import ErrorsAs, FrameError, OptionError, TwinError, format_count
 from twin.evaluation.degradation.condition import DegradedCase
 from twin.evaluation.degradation.shots import RealSource
 from twin.evaluation.degradation.sweep import SweepSettings
@@ -152,7 +152,8 @@ def consensus(spec: SensorSpec, frames: list[Frame], detectors: list[DetectorSpe
         truth.append(np.where(known[:, None], middle, np.nan))
     if not kept:
         raise FrameError(
-            f"none of {len(frames)} frames is good enough to start from; the first: {refused[0]}; try 'twin tune', then 'twin check'"
+            f"none of {format_count(len(frames), 'frames')} is good enough to start from; the first: {refused[0]}; "
+            "try 'twin tune', then 'twin check'"
         )
     return RealSource(spec, tuple(kept), np.stack(truth)), refused
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.camera.projection import Disc
-from twin.errors import FrameError
+from twin.errors import FrameError, format_count
 from twin.frames import open_recording, spread_indices
 from twin.frames.forms import gray_levels
 from twin.frames.recording import BadFrame
@@ -100,8 +100,8 @@ def read_real(
             numbers = {key: float(c[index]) for key, c in recording.labels.items() if c.dtype.kind == "f"}
             frames.append(RealFrame(frame, observation.pins_px, numbers))
     if not frames:
-        first = refused[0]
-        raise FrameError(f"{path}: none of {len(chosen)} frames are valid; the first, {first['image_name']}: {first['reason']}")
+        first, given = refused[0], format_count(len(chosen), "frames")
+        raise FrameError(f"{path}: none of {given} are valid; the first, {first['image_name']}: {first['reason']}")
     return RealFrames(frames, refused)
 
 

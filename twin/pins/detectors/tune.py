@@ -8,7 +8,7 @@ import numpy as np
 
 from scenes.pins import PinsSpec
 from scenes.sensor import BlobSpec, Polarity, RecordingSpec, SensorSpec
-from twin.errors import FrameError
+from twin.errors import FrameError, format_count
 from twin.frames import spread_indices
 from twin.frames.forms import pin_levels, polarity_of
 from twin.geometry.pins import pin_lattice
@@ -132,7 +132,7 @@ def tune(
     layout = score_layout(sensor.pins, images) if known is None else replace(known, seen=tuple(known.seen[k] for k in chosen))
     if layout is None or layout.explained < LEAST_SHOWN:
         raise FrameError(
-            f"none of {len(frames)} frames shows {sensor.pins.in_words()}{_shown_instead(images)}; "
+            f"none of {format_count(len(frames), 'frames')} shows {sensor.pins.in_words()}{_shown_instead(images)}; "
             "check `sensor`, focus and light, or give frames with less contact"
         )
     if known is None:
@@ -396,11 +396,11 @@ def _notes(best: DetectorSpec, evidence: Evidence, seen: int, frames: int) -> li
     """Reasons to doubt a tuning, and what to do."""
     notes = []
     if seen < frames:
-        notes.append(f"{frames - seen} of {frames} frames don't show the whole layout clearly; they took no part in finding the mask")
+        notes.append(f"the mask was found without {frames - seen} of {format_count(frames, 'frames')}, which don't show the whole layout")
     if evidence.low_rate < SURE_LOW_RATE:
         rate = 100 * evidence.exact_rate
         notes.append(
-            f"all pins in view found in {rate:.0f} % of {evidence.frames} frames: too few frames, or too poor ones, to be sure; give more"
+            f"all pins in view found in {rate:.0f} % of {format_count(evidence.frames, 'frames')}: to be sure, give more or better ones"
         )
     if evidence.threshold_slack < SURE_SLACK and not best.blob.spot_sigma_px:
         notes.append("the threshold may hardly change without losing pins: better light or focus would help")

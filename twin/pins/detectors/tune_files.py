@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from scenes import SensorSpec
-from twin.errors import OptionError
+from twin.errors import OptionError, format_count
 from twin.frames import Recording, evenly_read, open_recording
 from twin.frames.forms import known_sizes, times
 from twin.pins.detectors.detector_spec import Evidence, Method, write_detector
@@ -44,7 +44,8 @@ class TunedOnFrames(ReadableResult):
         blob, exact, low = detector.blob, 100 * evidence.exact_rate, 100 * evidence.low_rate
         (x, y), radius, slack = blob.mask_center_px, blob.mask_radius_px, evidence.mask_slack_px
         lines = [
-            f"{evidence.sure}: all pins in view found in {exact:.0f} % of {evidence.frames} frames (90 % sure: at least {low:.0f} %)",
+            f"{evidence.sure}: all pins in view found in {exact:.0f} % of {format_count(evidence.frames, 'frames')} "
+            f"(90 % sure: at least {low:.0f} %)",
             f"mask centre ({x:g}, {y:g}) px, radius {radius:g} px, {slack:g} px beyond the outermost pins",
         ]
         if recorder := detector.recording:

@@ -20,7 +20,7 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 from scenes.layouts.base import LatticeLayout
 from scenes.pins import PinsSpec, layout_from
 from scenes.sensor import Polarity
-from twin.errors import FrameError
+from twin.errors import FrameError, format_count
 from twin.frames import spread_indices
 from twin.frames.forms import is_two_level, levels_at, pin_levels
 from twin.geometry.pins import namings, pin_lattice, usual_spacing
@@ -287,7 +287,7 @@ def _identify_bright(images: list[np.ndarray], progress: Step) -> Identified:
     looks: list[Look] = [partial(_family_look, by) for by in searched]
     sizes = [_best_size(images[k], looks) for k in spread_indices(len(images), SIZED_ON)]
     if not any(sizes):
-        raise FrameError(f"none of {len(images)} frames shows pins in rings, a hexagon or a grid; {NO_LAYOUT}")
+        raise FrameError(f"none of {format_count(len(images), 'frames')} shows pins in rings, a hexagon or a grid; {NO_LAYOUT}")
     sigma = float(np.median([size for size in sizes if size]))
     spots = _spots(images, sigma)
     found: list[tuple[PinsSpec, list[LayoutInFrame]]] = []
@@ -303,7 +303,7 @@ def _identify_bright(images: list[np.ndarray], progress: Step) -> Identified:
     candidates = [c for c in candidates if c.explained >= LEAST_EXPLAINED and stand_out(images, c.seen, sigma)]
     candidates.sort(key=lambda c: -_merit(c))
     if not candidates:
-        raise FrameError(f"none of {len(images)} frames shows a whole layout of pins; {NO_LAYOUT}")
+        raise FrameError(f"none of {format_count(len(images), 'frames')} shows a whole layout of pins; {NO_LAYOUT}")
     doubts = _doubts(candidates)
     best, ends = candidates[0], []
     if open_sides(best.pins, best.rest_px, spots[0], find_beyond(images, best.rest_px, sigma)):

@@ -214,9 +214,9 @@ def grasp_scripted(work: Path, *, way: str) -> Measured:
     return {"success": Value(bench_grasp.solved(task, controller, observation="none"))}
 
 
-def grasp_learnt(work: Path, *, observation: str, seed: int) -> Measured:
+def grasp_learnt(work: Path, *, observation: str, seed: int, estimated: bool = False) -> Measured:
     """What PPO learns."""
-    share, steps, used_s = bench_grasp.learnt(observation, seed, out=work / "policy.zip")
+    share, steps, used_s = bench_grasp.learnt(observation, seed, out=work / "policy.zip", estimated=estimated)
     return {"success": Value(share), "steps": Value(steps), "core_minutes": Value(used_s / 60, "min")}
 
 
@@ -226,3 +226,7 @@ for way in bench_grasp.SCRIPTED:
 for observation, seed in product(("none", "wrench", "pins"), GRASP_SEEDS):
     options = f"--observation {observation} --seed {seed}"
     grasp_job(f"{observation}.seed{seed}", options, partial(grasp_learnt, observation=observation, seed=seed), GRASP_MINUTES)
+for observation, seed in product(("wrench", "pins"), GRASP_SEEDS):
+    options = f"--observation {observation} --estimator --seed {seed}"
+    measure = partial(grasp_learnt, observation=observation, seed=seed, estimated=True)
+    grasp_job(f"estimator.{observation}.seed{seed}", options, measure, GRASP_MINUTES)

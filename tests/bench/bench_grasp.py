@@ -53,6 +53,8 @@ ESTIMATOR_SHARE, EPOCHS, MODES = 0.2, 30, 32
 """Share of the steps from which the estimator learns, its passes over them, and its number of modes of each sensor's touch."""
 DRAWN, ANOTHER = (-0.5, 0.65), 0.06
 """Range of the logarithm of drawn grips over the least one, and how probable another draw is at a step."""
+UP, SPACING_PX = 0.3, 13.2
+"""Share of its way from which the hand counts as up, and the spacing of the pins."""
 N_PER_ACTION = 0.15
 """Change of the force by an action of 1, about."""
 LEAST_N, PER_LOAD = 0.45, 2.5
@@ -153,6 +155,20 @@ def estimator(observation, seed, steps):
     return estimate
 
 
+def estimator_errors(observation, steps=20_000, noise_px=0.1):
+    """Root mean square errors of the logarithm of grip over least grip while the hand is up, without and with noise of pins; its deviation.
+
+    The errors are those of other episodes than an estimator learns from.
+    """
+    estimate = estimator(observation, 0, steps)
+    state, touch, margin = drawn_grips(observation, 1, steps // 4)
+    up = state[:, 1] > UP
+    noise = torch.normal(0.0, noise_px / SPACING_PX, touch.shape, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        errors = [estimate(state, each)[up, 0] - margin[up] for each in (touch, touch + noise)]
+    return *(float(each.square().mean().sqrt()) for each in errors), float(margin[up].std())
+
+
 def solved(task, controller, episodes=EPISODES, **options):
     """Share of new episodes that are solved. A controller makes, of the environment at the start, a function of what is observed."""
     env, good = gymnasium.make(f"tactip/{task}-v0", disable_env_checker=True, **options), 0
@@ -228,7 +244,7 @@ def learnt(observation, seed, steps=STEPS, out=None, estimated=False):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--way", choices=("ppo", "constant", *SCRIPTED), default="ppo")
+    parser.add_argument("--way", choices=("ppo", "constant", "errors", *SCRIPTED), default="ppo")
     parser.add_argument("--observation", default="pins")
     parser.add_argument("--estimator", action="store_true", help="PPO sees the estimate of a network in place of the touch")
     parser.add_argument("--seed", type=int, default=0)
@@ -238,6 +254,8 @@ if __name__ == "__main__":
     if given.way == "constant":
         for grip_n in GRIPS_N:
             print(f"{grip_n:.1f} N solves {constant(grip_n):.0%}", flush=True)
+    elif given.way == "errors":
+        print("errors {:.3f}, with noise of pins {:.3f}, of a deviation of {:.3f}".format(*estimator_errors(given.observation)))
     elif given.way == "ppo":
         share, steps, used_s = learnt(given.observation, given.seed, given.steps, given.out, given.estimator)
         print(f"solved {share:.0%} of {EPISODES} episodes after {steps} steps, {used_s / 60:.1f} minutes of a core")

@@ -32,6 +32,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor  # noqa:
 from stable_baselines3.common.vec_env import VecNormalize  # noqa: E402
 
 import training.environments  # noqa: E402, F401
+from training.environments.grasp import GRIP_S, PERIOD_S  # noqa: E402
+from training.environments.grasp import STEPS as STEPS_OF_EPISODE  # noqa: E402
 from training.mujoco.grasp import WANTED  # noqa: E402
 
 GRIPS_N = (0.8, 1.1, 1.5, 2.0)
@@ -55,6 +57,8 @@ DRAWN, ANOTHER = (-0.5, 0.65), 0.06
 """Range of the logarithm of drawn grips over the least one, and how probable another draw is at a step."""
 UP, SPACING_PX = 0.3, 13.2
 """Share of its way from which the hand counts as up, and the spacing of the pins."""
+GAIN, WAITS = 5.0, GRIP_S / (STEPS_OF_EPISODE * PERIOD_S)
+"""Action per missing logarithm of the grip, and the share of the episode in which the hand waits."""
 N_PER_ACTION = 0.15
 """Change of the force by an action of 1, about."""
 LEAST_N, PER_LOAD = 0.45, 2.5
@@ -82,6 +86,10 @@ class GripEstimator(BaseFeaturesExtractor):
     def __init__(self, space, estimate):
         super().__init__(space, space["state"].shape[0] + 2)
         self.estimate = estimate.requires_grad_(False)
+
+    def apply(self, fn):
+        """Keep the weights, which PPO would set to random ones."""
+        return self
 
     def forward(self, seen):
         mean, log_sd = self.estimate(seen["state"], seen["tactile"][:, 0]).T
@@ -155,20 +163,6 @@ def estimator(observation, seed, steps):
     return estimate
 
 
-def estimator_errors(observation, steps=20_000, noise_px=0.1):
-    """Root mean square errors of the logarithm of grip over least grip while the hand is up, without and with noise of pins; its deviation.
-
-    The errors are those of other episodes than an estimator learns from.
-    """
-    estimate = estimator(observation, 0, steps)
-    state, touch, margin = drawn_grips(observation, 1, steps // 4)
-    up = state[:, 1] > UP
-    noise = torch.normal(0.0, noise_px / SPACING_PX, touch.shape, generator=torch.Generator().manual_seed(0))
-    with torch.no_grad():
-        errors = [estimate(state, each)[up, 0] - margin[up] for each in (touch, touch + noise)]
-    return *(float(each.square().mean().sqrt()) for each in errors), float(margin[up].std())
-
-
 def solved(task, controller, episodes=EPISODES, **options):
     """Share of new episodes that are solved. A controller makes, of the environment at the start, a function of what is observed."""
     env, good = gymnasium.make(f"tactip/{task}-v0", disable_env_checker=True, **options), 0
@@ -180,6 +174,27 @@ def solved(task, controller, episodes=EPISODES, **options):
             over = failed or late
         good += bool(info["is_success"])
     return good / episodes
+
+
+def by_estimate(observation, steps=STEPS // 5, noise_px=0.1):
+    """What an estimator is worth: its errors without and with noise of pins, the deviation of what it estimates, and a controller's share.
+
+    Errors are root mean squares, of steps of new episodes in which the hand is up. The controller closes in proportion to what is missing.
+    """
+    estimate = estimator(observation, 0, steps)
+    state, touch, margin = drawn_grips(observation, 1, steps // 4)
+    up = state[:, 1] > UP
+    noise = torch.normal(0.0, noise_px / SPACING_PX, touch.shape, generator=torch.Generator().manual_seed(0))
+
+    def act(seen):
+        (found, _) = estimate(torch.tensor(seen["state"])[None], torch.tensor(seen["tactile"][0])[None])[0]
+        waits = seen["state"][2] < WAITS
+        return np.array([0.0 if waits else np.clip(GAIN * (np.log(WANTED) - float(found)), -1, 1)])
+
+    with torch.no_grad():
+        errors = [estimate(state, each)[up, 0] - margin[up] for each in (touch, touch + noise)]
+        share = solved("GraspLift", lambda env: act, observation=observation)
+    return *(float(each.square().mean().sqrt()) for each in errors), float(margin[up].std()), share
 
 
 def grip_with(grip_n):
@@ -244,7 +259,7 @@ def learnt(observation, seed, steps=STEPS, out=None, estimated=False):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--way", choices=("ppo", "constant", "errors", *SCRIPTED), default="ppo")
+    parser.add_argument("--way", choices=("ppo", "constant", "estimate", *SCRIPTED), default="ppo")
     parser.add_argument("--observation", default="pins")
     parser.add_argument("--estimator", action="store_true", help="PPO sees the estimate of a network in place of the touch")
     parser.add_argument("--seed", type=int, default=0)
@@ -254,8 +269,8 @@ if __name__ == "__main__":
     if given.way == "constant":
         for grip_n in GRIPS_N:
             print(f"{grip_n:.1f} N solves {constant(grip_n):.0%}", flush=True)
-    elif given.way == "errors":
-        print("errors {:.3f}, with noise of pins {:.3f}, of a deviation of {:.3f}".format(*estimator_errors(given.observation)))
+    elif given.way == "estimate":
+        print("errors {:.3f}, with noise of pins {:.3f}, of a deviation of {:.3f}; solved {:.0%}".format(*by_estimate(given.observation)))
     elif given.way == "ppo":
         share, steps, used_s = learnt(given.observation, given.seed, given.steps, given.out, given.estimator)
         print(f"solved {share:.0%} of {EPISODES} episodes after {steps} steps, {used_s / 60:.1f} minutes of a core")

@@ -220,10 +220,10 @@ def grasp_learnt(work: Path, *, observation: str, seed: int, estimated: bool = F
     return {"success": Value(share), "steps": Value(steps), "core_minutes": Value(used_s / 60, "min")}
 
 
-def grasp_errors(work: Path, *, observation: str) -> Measured:
-    """How well the touch of one moment tells how much more the fingers grip than is needed."""
-    names = ("error", "error_with_noise", "deviation")
-    return {name: Value(each) for name, each in zip(names, bench_grasp.estimator_errors(observation), strict=True)}
+def grasp_estimate(work: Path, *, observation: str) -> Measured:
+    """How well the touch of one moment tells how much more the fingers grip than is needed, and what a controller solves by it."""
+    names = ("error", "error_with_noise", "deviation", "success")
+    return {name: Value(each) for name, each in zip(names, bench_grasp.by_estimate(observation), strict=True)}
 
 
 grasp_job("constant", "--way constant", grasp_constant, 5)
@@ -237,4 +237,4 @@ for observation, seed in product(("wrench", "pins"), GRASP_SEEDS):
     measure = partial(grasp_learnt, observation=observation, seed=seed, estimated=True)
     grasp_job(f"estimator.{observation}.seed{seed}", options, measure, GRASP_MINUTES)
 for observation in ("wrench", "pins"):
-    grasp_job(f"errors.{observation}", f"--way errors --observation {observation}", partial(grasp_errors, observation=observation), 5)
+    grasp_job(f"estimate.{observation}", f"--way estimate --observation {observation}", partial(grasp_estimate, observation=observation), 6)

@@ -139,7 +139,7 @@ class BaseArm(Connection):
     """Base class of the arms; see ``hardware.arms.arm.Arm`` for the methods."""
 
     axes: int
-    _unstopped = False  # whether the newest stop, or the undoing of a failed start, failed and this was reported
+    _unstopped = False  # whether the newest stop failed and this was reported
 
     @abstractmethod
     def stop(self) -> None: ...
@@ -204,13 +204,7 @@ class BaseArm(Connection):
         try:
             yield
         except BaseException as error:
-            told, self._unstopped = self._unstopped, True  # the error says so, if it can't be disabled
-
-            def disable() -> None:
-                self.disable()
-                self._unstopped = told
-
-            undo(disable, error)
+            undo(self.disable, error)
             raise
 
     def _require_possible(self, pose: np.ndarray) -> None:

@@ -160,8 +160,9 @@ class MG400(KinematicArm):
             self._await_mode(lambda mode: mode in ENABLED_MODES, "was not enabled; check its button and that no stop is pressed")
 
     def disable(self) -> None:
+        self._unstopped = True
         self._send_over_dashboard("DisableRobot()", "disabled")
-        self._under_way = self._enabled = False
+        self._unstopped = self._under_way = self._enabled = False
         self._dashboard.supervise()
         self._shows(lambda packet: int(packet["mode"]) not in ENABLED_MODES)  # so that the next state shows it
 

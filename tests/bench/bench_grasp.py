@@ -55,8 +55,10 @@ ESTIMATOR_SHARE, EPOCHS, MODES = 0.2, 30, 32
 """Share of the steps from which the estimator learns, its passes over them, and its number of modes of each sensor's touch."""
 DRAWN, ANOTHER = (-0.5, 0.65), 0.06
 """Range of the logarithm of drawn grips over the least one, and how probable another draw is at a step."""
-UP, SPACING_PX = 0.3, 13.2
-"""Share of its way from which the hand counts as up, and the spacing of the pins."""
+UP = 0.3
+"""Share of its way from which the hand counts as up."""
+NOISE_PX, SPACING_PX = 0.1, 13.2
+"""Noise of the pins, and their spacing, in which their displacements are observed."""
 GAIN, WAITS = 5.0, GRIP_S / (STEPS_OF_EPISODE * PERIOD_S)
 """Action per missing logarithm of the grip, and the share of the episode in which the hand waits."""
 N_PER_ACTION = 0.15
@@ -127,11 +129,8 @@ class Estimate(torch.nn.Module):
 
 def drawn_grips(observation, seed, steps):
     """States, touches, and logarithms of grip over least grip, of steps with grips about the least one."""
-    env, rng = (
-        gymnasium.make("tactip/GraspLift-v0", disable_env_checker=True, observation=observation).unwrapped,
-        np.random.default_rng(seed),
-    )
-    rows, over = [], True
+    env = gymnasium.make("tactip/GraspLift-v0", disable_env_checker=True, observation=observation).unwrapped
+    rng, rows, over = np.random.default_rng(seed), [], True
     while len(rows) < steps:
         if over:
             env.reset(seed=int(rng.integers(JUDGED_FROM)))
@@ -176,25 +175,30 @@ def solved(task, controller, episodes=EPISODES, **options):
     return good / episodes
 
 
-def by_estimate(observation, steps=STEPS // 5, noise_px=0.1):
-    """What an estimator is worth: its errors without and with noise of pins, the deviation of what it estimates, and a controller's share.
+def by_estimate(observation):
+    """What an estimator is worth: its error, that with noise of pins, the deviation of what it estimates, and a controller's share.
 
     Errors are root mean squares, of steps of new episodes in which the hand is up. The controller closes in proportion to what is missing.
     """
+    steps = round(ESTIMATOR_SHARE * STEPS)
     estimate = estimator(observation, 0, steps)
     state, touch, margin = drawn_grips(observation, 1, steps // 4)
     up = state[:, 1] > UP
-    noise = torch.normal(0.0, noise_px / SPACING_PX, touch.shape, generator=torch.Generator().manual_seed(0))
 
     def act(seen):
-        (found, _) = estimate(torch.tensor(seen["state"])[None], torch.tensor(seen["tactile"][0])[None])[0]
+        found = estimate(torch.tensor(seen["state"])[None], torch.tensor(seen["tactile"][0])[None])[0, 0]
         waits = seen["state"][2] < WAITS
         return np.array([0.0 if waits else np.clip(GAIN * (np.log(WANTED) - float(found)), -1, 1)])
 
+    def error(felt):
+        return float((estimate(state, felt)[up, 0] - margin[up]).square().mean().sqrt())
+
     with torch.no_grad():
-        errors = [estimate(state, each)[up, 0] - margin[up] for each in (touch, touch + noise)]
-        share = solved("GraspLift", lambda env: act, observation=observation)
-    return *(float(each.square().mean().sqrt()) for each in errors), float(margin[up].std()), share
+        found = {"error": error(touch), "deviation": float(margin[up].std())}
+        if observation == "pins":
+            noise = torch.normal(0.0, NOISE_PX / SPACING_PX, touch.shape, generator=torch.Generator().manual_seed(0))
+            found["error_with_noise"] = error(touch + noise)
+        return found | {"success": solved("GraspLift", lambda env: act, observation=observation)}
 
 
 def grip_with(grip_n):
@@ -270,7 +274,7 @@ if __name__ == "__main__":
         for grip_n in GRIPS_N:
             print(f"{grip_n:.1f} N solves {constant(grip_n):.0%}", flush=True)
     elif given.way == "estimate":
-        print("errors {:.3f}, with noise of pins {:.3f}, of a deviation of {:.3f}; solved {:.0%}".format(*by_estimate(given.observation)))
+        print("; ".join(f"{name} {value:.3f}" for name, value in by_estimate(given.observation).items()))
     elif given.way == "ppo":
         share, steps, used_s = learnt(given.observation, given.seed, given.steps, given.out, given.estimator)
         print(f"solved {share:.0%} of {EPISODES} episodes after {steps} steps, {used_s / 60:.1f} minutes of a core")

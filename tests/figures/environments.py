@@ -222,8 +222,7 @@ def grasp_learnt(work: Path, *, observation: str, seed: int, estimated: bool = F
 
 def grasp_estimate(work: Path, *, observation: str) -> Measured:
     """How well the touch of one moment tells how much more the fingers grip than is needed, and what a controller solves by it."""
-    names = ("error", "error_with_noise", "deviation", "success")
-    return {name: Value(each) for name, each in zip(names, bench_grasp.by_estimate(observation), strict=True)}
+    return {name: Value(each) for name, each in bench_grasp.by_estimate(observation).items()}
 
 
 grasp_job("constant", "--way constant", grasp_constant, 5)

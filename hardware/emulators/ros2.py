@@ -108,11 +108,13 @@ class Ros2Emulator(Emulator):
             self._twist = np.array([list(message["twist"][part].values()) for part in ("linear", "angular")])
 
     def _move(self, here: np.ndarray, dt_s: float) -> np.ndarray:
-        T = matrix_of(here)
         if self._kind == POSE:
+            if np.array_equal(here, self._target):
+                return here
             return between(STAGE, here, self._target, FASTEST * dt_s / max(*measure_way(here, self._target), 1e-9), True)
         if not self._twist.any() or time.time() > self._until_s:
             return here
+        T = matrix_of(here)
         T[:3, 3] += dt_s * ros.MM_PER_M * self._twist[0]
         T[:3, :3] = Rotation.from_rotvec(dt_s * self._twist[1]).as_matrix() @ T[:3, :3]
         return pose_of(T, here)

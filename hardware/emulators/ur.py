@@ -13,6 +13,7 @@ import struct
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from functools import cache
 from threading import Event, Lock, Thread
 from typing import Any
 
@@ -116,12 +117,13 @@ class UrController:
                     self.end_program()
             elif self.runtime_state == STOPPED and self._program is not None and now_s >= self._starts_s:
                 self.runtime_state = PLAYING
-            joints = self.track.joints_deg(now_s)
+            pose = self.track.pose(now_s)
+            joints = self.kinematics.inverse(pose) if self.track.target().linear else self.track.joints_deg(now_s)
             speed = np.radians(joints - self.kinematics.near_deg) / max(now_s - self._cycled_s, CYCLE_S / 2)
             self.kinematics.near_deg[:], self._cycled_s = joints, now_s
             values: dict[str, Any] = dict.fromkeys(("actual_q", "target_q"), np.radians(joints))
             values |= dict.fromkeys(("actual_qd", "target_qd"), speed)
-            values |= dict.fromkeys(("actual_TCP_pose", "target_TCP_pose"), pose_to_ur(self.track.pose(now_s)))
+            values |= dict.fromkeys(("actual_TCP_pose", "target_TCP_pose"), pose_to_ur(pose))
             values |= dict.fromkeys(("speed_scaling", "target_speed_fraction"), self.faults.factor("slider"))
             values |= {name: getattr(self, name) for name in ("robot_mode", "safety_mode", "runtime_state")}
             values["safety_status_bits"] = {NORMAL: 1, PROTECTIVE: 4, EMERGENCY: 128}[self.safety_mode]
@@ -217,6 +219,7 @@ COMMANDS: dict[int, Callable[[UrController], None]] = {
 }
 
 
+@cache
 def type_of(name: str) -> str:
     """The type of an RTDE variable; NOT_FOUND if there is none of this name."""
     return next((kind for kind, names in NAMES.items() if re.fullmatch(names, name)), "NOT_FOUND")
@@ -289,11 +292,11 @@ class UrEmulator(Emulator):
             present = self.arm.cycle()
             values = values if "frozen-feedback" in self.faults else present
             for connection, names in self._streams.copy().items() if "silent" not in self.faults else ():
-                content = b"\1"
-                for layout, name in ((">" + TYPES[type_of(name)], name) for name in names):
-                    content += struct.pack(layout, *np.broadcast_to(values.get(name, 0), int(layout[1:-1] or 1)).tolist())
+                layouts = [TYPES[type_of(name)] for name in names]
+                given = ((values.get(name, 0), int(layout[:-1] or 1)) for name, layout in zip(names, layouts, strict=True))
+                numbers = [number for value, size in given for number in (size * (value,) if np.isscalar(value) else value)]
                 with contextlib.suppress(OSError):
-                    _send(connection, b"U", content)
+                    _send(connection, b"U", b"\1" + struct.pack(">" + "".join(layouts), *numbers))
 
     def _serve_dashboard(self, connection: socket.socket) -> None:
         connection.sendall(b"Connected: Universal Robots Dashboard Server\n")

@@ -1,6 +1,7 @@
 """One contract for every arm: simulated, MG400 over TCP, Magician over a pseudo-terminal, UR through its client, any over ROS 2."""
 
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -62,19 +63,27 @@ class TestUr(OfBench):
     kind = "ur"
 
 
-@pytest.fixture(params=ARMS)
-def at(request):
-    with bench(request.param) as at:
+@contextmanager
+def at_home(kind):
+    with bench(kind) as at:
+        at.arm.connect()
+        at.arm.enable()
+        at.arm.set_speed(FAST_MM_S, FAST_MM_S)
+        at.arm.move_linear(at.home)
         yield at
 
 
-@pytest.fixture
-def ready(at):
-    at.arm.connect()
-    at.arm.enable()
-    at.arm.set_speed(FAST_MM_S, FAST_MM_S)
-    at.arm.move_linear(at.home)
-    return at
+@pytest.fixture(params=ARMS)
+def ready(request):
+    with at_home(request.param) as at:
+        yield at
+
+
+@pytest.fixture(scope="module", params=ARMS)
+def resting(request):
+    """An arm for tests in which nothing moves."""
+    with at_home(request.param) as at:
+        yield at
 
 
 def test_a_move_to_where_it_is_returns_soon(ready):
@@ -109,19 +118,19 @@ BAD = [
 
 
 @pytest.mark.parametrize("given", BAD, ids=lambda given: repr(given)[:12])
-def test_a_target_that_is_not_numbers_is_told_and_nothing_moves(ready, given):
-    joints = f"the joint angles must be {ready.arm.axes} finite numbers"
-    for move, told in ((ready.arm.move_joints, joints), (ready.arm.move_linear, "the pose must be 6 finite numbers")):
+def test_a_target_that_is_not_numbers_is_told_and_nothing_moves(resting, given):
+    joints = f"the joint angles must be {resting.arm.axes} finite numbers"
+    for move, told in ((resting.arm.move_joints, joints), (resting.arm.move_linear, "the pose must be 6 finite numbers")):
         with pytest.raises(DeviceError, match=told):
             move(given)
-    assert np.allclose(ready.arm.state().pose, ready.home, atol=0.01) and not ready.arm.state().moving
+    assert np.allclose(resting.arm.state().pose, resting.home, atol=0.01) and not resting.arm.state().moving
 
 
 @pytest.mark.parametrize("far", [2e4, 1e12, 1e300])
-def test_a_target_farther_than_any_arm_reaches_is_told_at_once(ready, far):
+def test_a_target_farther_than_any_arm_reaches_is_told_at_once(resting, far):
     begun = time.monotonic()
-    safe = SafeArm(ready.arm, load_limits("simulated").model_copy(update={"joints_deg": None}))
-    for arm in (ready.arm, safe):
+    safe = SafeArm(resting.arm, load_limits("simulated").model_copy(update={"joints_deg": None}))
+    for arm in (resting.arm, safe):
         for move, count in ((arm.move_joints, arm.axes), (arm.move_linear, 6)):
             if arm is safe and arm.kinematics is None and move == arm.move_joints:
                 continue  # SafeArm refuses it for that reason

@@ -84,7 +84,7 @@ FPS, STEPS, HEALTHY_STEPS = 30.0, 60, 8
 # Distances, mm, from the object at which a fault comes in a phase of the approach.
 GAPS_MM = {"approach": (8.0, 20.0), "near": (-2.0, NEAR_MM)}
 CLEAR_MM, WAIT_S, FRAME_WAIT_S = 25.0, 0.6, 1.0
-STEP_S, REST_S = 0.005, 0.06
+POLL_S, STEP_S, REST_S = 0.01, 0.005, 0.06
 PRESSED_MM = 6.0  # depth that the limits allow
 # What a busy machine may add, s.
 BUSY_S = 0.15
@@ -173,10 +173,14 @@ def placed_can(kind: str) -> PlacedObject:
 
 
 def program(
-    kind: str, command: str, place: tuple[int, ...] | str, url: str, folder: Path, pose=None, *, steps: int = STEPS, stops=None
+    kind: str, command: str, place: tuple[int, ...] | str, url: str, folder: Path, pose=None, *, steps: int = STEPS, stops=None, scale=1.0
 ) -> Callable[[], None]:
     """What runs the command with an arm at its ports, at its serial line or in its namespace of topics."""
     placed, servo = placed_can(kind), load_servo(KINDS[kind][0]).model_copy(update={"clear_mm": CLEAR_MM})
+    limits = SafetyLimits(box_mm=((-2000, 2000),) * 3)
+    if kind.startswith("ros2"):  # its emulator has no scale of time
+        servo = servo.model_copy(update={"linear_mm_s": scale * servo.linear_mm_s, "angular_deg_s": scale * servo.angular_deg_s})
+        limits = limits.model_copy(update={"retreat_mm_s": scale * limits.retreat_mm_s})
     if kind.startswith("ros2"):
         device = Ros2Arm(kind[5:], namespace=place)
         hold = device._hold
@@ -185,7 +189,7 @@ def program(
         device = MG400("127.0.0.1", ports=Mg400Ports(place[0], place[1], tuple(place[2:])))
     else:
         device = UR(place) if kind == "ur" else Magician(place)
-    arm = SafeArm(device, SafetyLimits(box_mm=((-2000, 2000),) * 3))
+    arm = SafeArm(device, limits)
     source = MjpegCamera(url, load_sensor("mg400-331"), Form.RAW)
 
     rig = Rig(source, arm, placed, False)
@@ -210,8 +214,8 @@ def program(
     return run
 
 
-def measure(seed: int, case: tuple[str, str, str] | None = None, kind: str = "mg400") -> Run:
-    """Make one run."""
+def measure(seed: int, case: tuple[str, str, str] | None = None, kind: str = "mg400", *, scale: float = 1.0) -> Run:
+    """Make one run with an arm that is faster than a real one by the factor ``scale``."""
     command, phase, fault = case or draw(seed, kind)
     rng, placed = random.Random(seed), placed_can(kind)
     gap_mm = rng.uniform(*GAPS_MM.get(phase, (0.0, 0.0)))
@@ -225,7 +229,7 @@ def measure(seed: int, case: tuple[str, str, str] | None = None, kind: str = "mg
             emulator = stack.enter_context(Ros2Emulator(kind[5:], namespace=place, pose=start))
         else:
             makes = {"magician": MagicianEmulator, "mg400": partial(Mg400Emulator, port_offset=None), "ur": partial(UrEmulator, host=None)}
-            emulator = stack.enter_context(makes[kind]())
+            emulator = stack.enter_context(makes[kind](time_scale=scale))
             if kind == "mg400":
                 place = tuple(emulator.ports[port] for port in (29999, 30003, 30004, 30005))
             else:
@@ -237,12 +241,12 @@ def measure(seed: int, case: tuple[str, str, str] | None = None, kind: str = "mg
         process = None
         if fault == KILLED:
             words = f"import sys; sys.path[:0] = {sys.path!r}; from pathlib import Path; from blind_runs import program"
-            call = f"program({kind!r}, {command!r}, {place!r}, {camera.url!r}, Path({str(folder / 'data')!r}))()"
+            call = f"program({kind!r}, {command!r}, {place!r}, {camera.url!r}, Path({str(folder / 'data')!r}), scale={scale})()"
             process = subprocess.Popen([sys.executable, "-c", f"{words}; {call}"], stderr=subprocess.DEVNULL)
             thread = threading.Thread(target=lambda: (process.wait(), done.set()), daemon=True)
         else:
             steps = HEALTHY_STEPS if fault == HEALTHY else STEPS
-            act = program(kind, command, place, camera.url, folder / "data", emulator.pose, steps=steps, stops=stops)
+            act = program(kind, command, place, camera.url, folder / "data", emulator.pose, steps=steps, stops=stops, scale=scale)
 
             def go() -> None:
                 try:
@@ -267,7 +271,7 @@ def measure(seed: int, case: tuple[str, str, str] | None = None, kind: str = "mg
         done.wait(30.0)
         time.sleep(1.2 if process is not None else 0.1)
         ended, told_s = done.is_set(), time.monotonic()
-        found = _judged(emulator, placed, fault_s, [at_s for at_s in stops if at_s < told_s])
+        found = (0.0,) * 4 if fault == HEALTHY else _judged(emulator, placed, fault_s, [at_s for at_s in stops if at_s < told_s])
         if isinstance(emulator, Ros2Emulator):  # no more commands come
             commands, pose = emulator.commands, emulator.pose()
             time.sleep(0.2)
@@ -312,15 +316,15 @@ def _await_phase(emulator, placed, phase: str, gap_mm: float, later_s: float, do
             touched_s = now_s
         if touched_s is not None and now_s > touched_s + later_s:
             return
-        time.sleep(0.002)
+        time.sleep(POLL_S)
 
 
 def _judged(emulator, placed, fault_s: float, stops: list[float]) -> tuple[float, float, float, float]:
     """Time until the stop, time until the arm stood, travel towards the object, and the part of it in contact."""
     times = np.arange(fault_s, time.monotonic(), STEP_S)
     poses = np.array([emulator.pose(time_s) for time_s in times])
-    depths = np.array([placed.touch(pose).indent_mm for pose in poses])
     moves = np.r_[np.abs(np.diff(poses, axis=0)).max(axis=1) > 1e-6, False]
+    depths = np.array([placed.touch(pose).indent_mm for pose in poses[np.r_[True, moves[:-1]]]])  # elsewhere as just before
     segments: list[list[int]] = []  # first and last sample of each motion
     for k in np.flatnonzero(moves):
         if segments and (k - segments[-1][1]) * STEP_S < REST_S:

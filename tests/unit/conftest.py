@@ -89,6 +89,12 @@ def contacts(made_once):
 
 
 @pytest.fixture
+def no_assumption_costs(monkeypatch):
+    """Costs of assumptions, seconds of simulated contacts, are left out: for tests that look at something else of a new sensor."""
+    monkeypatch.setattr("twin.calibration.new_sensor.cost_of_assumptions", lambda sensor, *, progress: [])
+
+
+@pytest.fixture
 def undrawn_charts(monkeypatch):
     """Charts of pages are made, but not drawn, which takes seconds: for tests that look at something else of a page."""
     monkeypatch.setattr("twin.report.charts.save_figure", lambda path, figure, **_: write_image(path, np.zeros((8, 8), np.uint8)))

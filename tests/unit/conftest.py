@@ -7,6 +7,7 @@ import pytest
 from drawn_recording import config_of, drawn_dataset
 from filelock import FileLock
 from small_generation import SENSOR, small_config
+from unknown_sensor import leave_out_costs
 
 from scenes import load_experiment, load_sensor
 from training.generation import generate
@@ -91,7 +92,7 @@ def contacts(made_once):
 @pytest.fixture
 def no_assumption_costs(monkeypatch):
     """Costs of assumptions, seconds of simulated contacts, are left out: for tests that look at something else of a new sensor."""
-    monkeypatch.setattr("twin.calibration.new_sensor.cost_of_assumptions", lambda sensor, *, progress: [])
+    leave_out_costs(monkeypatch)
 
 
 @pytest.fixture

@@ -1,6 +1,11 @@
 """Compilation with Numba. The machine code is stored on disk for later processes, if the disk can be written."""
 
+import atexit
+import subprocess
+import sys
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -44,6 +49,30 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         return dispatcher
 
     return decorate
+
+
+@cache
+def begin_compiling(module: str, mark: Any) -> None:
+    """Run a module that compiles what is soon needed, in a process of its own, unless the machine code of ``mark`` is stored on disk.
+
+    The process ends with this one at the latest.
+
+    Parameters
+    ----------
+    module : str
+    mark : compiled function
+        One of the functions that the module compiles.
+    """
+    folder = mark.stats.cache_path
+    if folder is None or any(Path(folder).glob(f"*.{mark.__name__}-*.nbi")):
+        return
+    child = subprocess.Popen([sys.executable, "-m", module], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    def end() -> None:
+        child.kill()
+        child.wait()
+
+    atexit.register(end)
 
 
 def _warn(why: str) -> None:

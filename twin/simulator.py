@@ -12,7 +12,8 @@ from scenes.base import SpecError
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.camera.capture import expose, in_form
-from twin.camera.truth import CapTruth, cap_truth
+from twin.camera.truth import CapTruth, cap_truth, segment_distance
+from twin.compiled import begin_compiling
 from twin.errors import ContactError, FrameError, OptionError
 from twin.frames.forms import form_named, frame_size
 from twin.frames.images import write_image
@@ -146,6 +147,7 @@ class Simulator:
             If the indentation is negative or the pose is out of reach, or if the solver does not converge.
         """
         _require_contact(obj, pose)
+        begin_compiling("twin.prepare", segment_distance)  # a picture may follow
         told = None if progress is None else lambda fraction, _: progress(fraction)
         return self.solver.press(obj, pose, friction=friction, compliance_mm_per_n=compliance_mm_per_n, progress=told)
 

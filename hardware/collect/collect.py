@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats.qmc import Sobol
 
 from hardware.arms.arm import ArmState
 from hardware.cameras.mjpeg import without_secrets
@@ -186,6 +185,8 @@ def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str 
     if design == "random":
         numbers = np.random.default_rng([seed, index]).uniform(low, high)
         return PlannedContact(numbers[:6], numbers[6:])
+    from scipy.stats.qmc import Sobol
+
     varied = high > low
     sequence = Sobol(int(varied.sum()), scramble=True, rng=np.random.default_rng(seed))
     shares = sequence.fast_forward(index).random(1)[0] if index else sequence.random(1)[0]

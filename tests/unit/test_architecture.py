@@ -47,6 +47,7 @@ TWIN_LAYERS = (  # of twin's packages and modules, the innermost first: each may
     "estimate",
     "policy",
     "simulator",
+    "prepare",
     "one_contact",
     "evaluation",
     "calibration",

@@ -2,6 +2,9 @@
 
 import errno
 import importlib.util
+import os
+import subprocess
+import sys
 import warnings
 
 import numba
@@ -58,3 +61,35 @@ def test_other_errors_of_the_compiler_are_not_taken_for_it(functions, monkeypatc
     monkeypatch.setattr(numba, "njit", broken)
     with pytest.raises(RuntimeError, match="no such option"):
         compiled()(functions[0])
+
+
+BESIDE = """
+import subprocess, sys, time
+from pathlib import Path
+from functions import doubled
+from twin.compiled import begin_compiling, compiled
+class Counted(subprocess.Popen):
+    def __init__(self, *given, **how):
+        super().__init__(*given, **how)
+        print("started", self.pid)
+subprocess.Popen = Counted
+function = compiled()(doubled)
+if sys.argv[1] == "stored": function(2)
+begin_compiling("beside", function)
+begin_compiling("beside", function)
+while sys.argv[1] == "new" and not Path("begun").exists(): time.sleep(0.01)
+"""
+ENDLESS = "import pathlib, time\npathlib.Path('begun').touch()\ntime.sleep(600)"
+
+
+@pytest.mark.parametrize("how", ["new", "stored"])
+def test_a_module_compiles_beside_what_is_not_stored_and_ends_with_the_program(how, functions, tmp_path):
+    (tmp_path / "beside.py").write_text(ENDLESS)
+    there = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path]), "NUMBA_CACHE_DIR": str(tmp_path / "kept")}
+    command = [sys.executable, "-c", BESIDE, how]
+    done = subprocess.run(command, cwd=tmp_path, env=there, check=True, timeout=60, capture_output=True, text=True)
+    started = [int(line.split()[1]) for line in done.stdout.splitlines()]
+    assert len(started) == (how == "new")
+    for process in started:
+        with pytest.raises(ProcessLookupError):
+            os.kill(process, 0)

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats.qmc import Sobol
 
 from training.data.label_code import LabelCode, goes_round
 
@@ -19,6 +18,8 @@ def nearest_to_even(labels: np.ndarray, units: Sequence[str], count: int, *, see
     seed : int
         Seed of the even sequence, a scrambled Sobol sequence.
     """
+    from scipy.stats.qmc import Sobol
+
     code = LabelCode(goes_round(units, labels))
     low, high = labels.min(axis=0), labels.max(axis=0)
     circular, varied = np.array(code.circular), np.flatnonzero(high > low)

@@ -3,21 +3,23 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from scenes.experiment import LABELS, ExperimentSpec
 from scenes.load import list_experiments, load_experiment
 from scenes.pins import PinsSpec
-from twin.calibration.contact.calibrate import LABELS as CONTACTS
-from twin.calibration.contact.calibrate import ContactCalibration, calibrate_to_file
 from twin.calibration.new_sensor import LIMIT, NewSensor, new_sensor
-from twin.calibration.optics import OpticsCalibration, calibrate_optics
 from twin.errors import OptionError
 from twin.frames import frames_at, open_recording
 from twin.frames.tables import numbers
 from twin.progress import Progress, silent
 from twin.types import FINE, Form, ReadableResult
+
+if TYPE_CHECKING:
+    from twin.calibration.contact.calibrate import ContactCalibration
+    from twin.calibration.optics import OpticsCalibration
 
 ALIKE = 0.6
 """Least share of varying labels that a table and an experiment have in common, of the labels that vary in either of them."""
@@ -41,8 +43,8 @@ class WholeSensor(ReadableResult):
 
     made: NewSensor
     experiment: ExperimentSpec | None
-    optics: OpticsCalibration | None
-    contact: ContactCalibration | None
+    optics: "OpticsCalibration | None"
+    contact: "ContactCalibration | None"
 
     @property
     def written(self) -> list[Path]:
@@ -69,7 +71,7 @@ def whole_sensor(
     labels: Path | None = None,
     optics: bool = False,
     experiment: ExperimentSpec | None = None,
-    contacts: int = CONTACTS,
+    contacts: int = 20,
     workers: int = 1,
     across: int = FINE,
     layout: PinsSpec | None = None,
@@ -118,11 +120,15 @@ def whole_sensor(
         limit=limit,
         progress=progress,
     )
-    sensor = made.sensor
-    light = calibrate_optics(frames, sensor, out, no_contact=no_contact, progress=progress) if optics else None
-    sensor = light.found.spec if light else sensor
-    contact = None
+    sensor, light, contact = made.sensor, None, None
+    if optics:
+        from twin.calibration.optics import calibrate_optics
+
+        light = calibrate_optics(frames, sensor, out, no_contact=no_contact, progress=progress)
+        sensor = light.found.spec
     if labels is not None and experiment is not None:
+        from twin.calibration.contact.calibrate import ContactCalibration, calibrate_to_file
+
         found = calibrate_to_file(
             at, sensor, experiment, out, labels=contacts, workers=workers, across=across, form=form, progress=progress
         )

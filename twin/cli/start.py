@@ -97,7 +97,7 @@ def doctor(
     from hardware.live.doctor import examine_machine
 
     if prepare:
-        from hardware.live.prepare import compile_ahead
+        from twin.prepare import compile_ahead
 
         compile_ahead(progress=progress)
     return examine_machine()

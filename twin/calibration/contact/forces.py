@@ -24,7 +24,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
@@ -361,7 +361,7 @@ def compare_table(
         both = setup.forces([setup.start, value], arm, step)
     first, simulated = (setup.readings(f, of) for f, of in zip(both, (setup.start, value), strict=True))
     each_row, offset_n = int((determined >= DETERMINED).sum()) / 3, value[-4:-1]
-    half = student.ppf(COVERED, max(len(chosen) - each_row, 1)) * np.sqrt(1 + each_row / len(chosen)) * spread * noise_of(simulated)
+    half = stdtrit(max(len(chosen) - each_row, 1), COVERED) * np.sqrt(1 + each_row / len(chosen)) * spread * noise_of(simulated)
     poses, moves = poses_and_moves(arm)
     of = {"depth": poses[:, 2:3], "tilt": poses[:, 3:5], "shear": moves[:, :2], "twist": moves[:, 5:], "slip": both[1, :, 6:]}
     by = {key: np.linalg.norm(each, axis=1) if key != "depth" else each[:, 0] for key, each in of.items()}

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from scenes.body import ASSUMED_FACTOR
 from scenes.experiment import ExperimentSpec
@@ -84,7 +84,7 @@ def compare_forces(measured_n: ArrayLike, simulated_n: ArrayLike, sensor: Sensor
     if count < FEWEST_PRESSES:
         return assume_stiffness(sensor, f"too few presses with a force ({count})")
     ratio = np.log(measured[usable] / simulated[usable])
-    error = float(ratio.std(ddof=1) / np.sqrt(count) * student.ppf(COVERED, count - 1))
+    error = float(ratio.std(ddof=1) / np.sqrt(count) * stdtrit(count - 1, COVERED))
     scale, factor = float(np.exp(ratio.mean())), float(np.exp(error))
     return Newtons(
         count,

@@ -14,7 +14,6 @@ from itertools import product
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
-from scipy.stats import qmc
 
 from scenes import load_object
 from scenes.experiment import ExperimentSpec
@@ -122,12 +121,14 @@ class TapBank:
 
 def bank_labels(rig: RigSpec, experiment: ExperimentSpec, labels: list[ArmLabel], radius_mm: float) -> list[ArmLabel]:
     """Labels that cover the range of contacts which the given labels may have with any fitted rig."""
+    from scipy.stats.qmc import Sobol
+
     axis, turns = experiment.axis, tilts_of(experiment)
     depth = np.array([label.pose[axis] for label in labels]) + experiment.zero_mm
     steepest_deg = np.hypot(*np.array([label.pose[turns] for label in labels]).T).max() + BANK_MARGIN_DEG
     shallowest, deepest = max(depth.min() - BANK_BELOW_MM, LEAST_INDENT_MM), depth.max() + BANK_ABOVE_MM
     out = []
-    for share, radial, angle in qmc.Sobol(3, seed=0).random_base2(int(np.ceil(np.log2(BANK_TAPS))))[:BANK_TAPS]:
+    for share, radial, angle in Sobol(3, seed=0).random_base2(int(np.ceil(np.log2(BANK_TAPS))))[:BANK_TAPS]:
         tilt = steepest_deg * np.sqrt(radial) * np.exp(2j * np.pi * angle)
         pose = np.zeros(6)
         pose[turns] = np.array([tilt.real, tilt.imag]) - np.array(rig.turn_offset_deg)[np.array(turns) - 3]

@@ -1,6 +1,7 @@
 """Compiles, ahead of the first use, what commands need: functions of the skin's mechanics, the rasteriser and the pin pipeline.
 
-Numba stores the machine code on disk (`twin.compiled`), so that later processes load it. Parts are compiled in processes of their own.
+Numba stores the machine code on disk (`twin.compiled`), so that later processes load it. Parts are compiled in processes of their own. As
+a program, this module compiles what a picture needs: the first contact of all starts it beside itself.
 """
 
 import os
@@ -47,3 +48,7 @@ def _look() -> None:
     seen = pipeline(frame)
     if seen.graph is not None:
         node_features(seen.graph, pipeline.reference)
+
+
+if __name__ == "__main__":
+    _look()

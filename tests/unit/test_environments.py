@@ -375,8 +375,8 @@ def test_every_task_is_registered():
 )
 def test_an_id_with_the_packages_name_is_known_whatever_is_imported_first(first):
     """And without torch, which only estimates of a pose need: it takes two seconds."""
-    code = f"{first}; print(gymnasium.make('twin:tactip/EdgeFollow-v0', observation='oracle').spec.id, 'torch' in __import__('sys').modules)"
-    told = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
+    code = f"{first}; print(gymnasium.make('twin:tactip/EdgeFollow-v0', observation='oracle').spec.id, 'torch' in sys.modules)"
+    told = subprocess.run([sys.executable, "-W", "ignore", "-c", f"import sys; {code}"], capture_output=True, text=True, check=True)
     assert told.stdout.split()[-2:] == ["tactip/EdgeFollow-v0", "False"]
 
 

@@ -104,17 +104,9 @@ class Eye:
     def __init__(self, sensor: SensorSpec, count: int, kind: Kind, *, pictures: Pictures, pin_noise_px: float) -> None:
         self.sensor, self.kind, self.pictures, self._noise_px = sensor, kind, pictures, pin_noise_px
         self._estimator: PoseEstimator | None = None
-        self._sees_light = False  # whether the estimator uses the light on the caps
+        self._sees_light = False
         if kind == "pose":
-            from training.estimate.estimator import PoseEstimator  # loads torch, which other observations do not need
-            from training.models.part import PinModel
-            from training.runs.run_files import shipped_names
-
-            if sensor.name not in shipped_names():
-                known = ", ".join(shipped_names())
-                raise OptionError(f"observation 'pose' needs shipped weights; {sensor.name} has none (there are those of {known} have)")
-            self._estimator = PoseEstimator.load(sensor.name)
-            self._sees_light = isinstance(self._estimator.part, PinModel) and self._estimator.part.sees_light
+            self._estimator, self._sees_light = _load_estimator(sensor)
             if self._sees_light and pictures == "none":
                 raise OptionError(f"observation 'pose': the weights of {sensor.name} also need the light on caps; give pictures='preview'")
         self.form = self._estimator.form if self._estimator else Form.PROCESSED if sensor.recording else Form.RAW
@@ -210,6 +202,19 @@ class Eye:
         scale = np.array([POSE_SCALES[unit] for unit in self._estimator.units])
         known = np.nan_to_num(np.asarray(executed, float).reshape(len(value), 1), nan=1.0)
         return np.clip(np.concatenate([value / scale, known], axis=1), -LARGEST, LARGEST).astype(np.float32)
+
+
+def _load_estimator(sensor: SensorSpec) -> tuple["PoseEstimator", bool]:
+    """The shipped estimator of a sensor, and whether it uses the light on the caps."""
+    from training.estimate.estimator import PoseEstimator  # loads torch, which other observations do not need
+    from training.models.part import PinModel
+    from training.runs.run_files import shipped_names
+
+    if sensor.name not in shipped_names():
+        known = ", ".join(shipped_names())
+        raise OptionError(f"observation 'pose' needs shipped weights; {sensor.name} has none (there are those of {known} have)")
+    found = PoseEstimator.load(sensor.name)
+    return found, isinstance(found.part, PinModel) and found.part.sees_light
 
 
 def _painter(sensor: SensorSpec, form: Form, pictures: Pictures) -> Callable[[PinState, np.random.Generator], Frame]:

@@ -109,7 +109,7 @@ _recent: OrderedDict[tuple[bytes, tuple[int, ...], float], Bumps] = OrderedDict(
 
 def recent_bumps(gray: np.ndarray, sigma_px: float) -> Bumps:
     """As ``find_bumps``; the last results are kept, because the same frames are compared with several layouts."""
-    key = hashlib.blake2b(np.ascontiguousarray(gray)).digest(), gray.shape, sigma_px
+    key = hashlib.blake2b(np.ascontiguousarray(gray).data).digest(), gray.shape, sigma_px
     found = _recent.pop(key, None) or find_bumps(gray, sigma_px)
     _recent[key] = found
     while len(_recent) > KEPT:

@@ -21,8 +21,11 @@ sys.dont_write_bytecode = False
 import pytest  # noqa: E402
 from compiling import compile_all  # noqa: E402
 from hypothesis import settings  # noqa: E402
+from threadpoolctl import threadpool_limits  # noqa: E402
 
 from scenes import load_sensor  # noqa: E402
+
+threadpool_limits(1)  # where a plugin of pytest has imported numpy before the variables were set
 
 # The same code gives the same answer: what Hypothesis draws follows from the test, not from the clock. `make validate` draws again.
 settings.register_profile("same", derandomize=True)

@@ -7,6 +7,7 @@ import pytest
 from drawn_recording import config_of, drawn_dataset
 from filelock import FileLock
 from small_generation import SENSOR, small_config
+from unknown_sensor import leave_out_costs
 
 from scenes import load_experiment, load_sensor
 from training.generation import generate
@@ -86,6 +87,12 @@ def contacts(made_once):
 
     home = made_once("maps", make)
     return home / "set", home / "run", load_sensor(SENSOR)
+
+
+@pytest.fixture
+def no_assumption_costs(monkeypatch):
+    """Costs of assumptions, seconds of simulated contacts, are left out: for tests that look at something else of a new sensor."""
+    leave_out_costs(monkeypatch)
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from drawn_frames import draw_discs, smooth_warp
 from scipy.spatial import cKDTree
-from unknown_sensor import frames_of, rest_of
+from unknown_sensor import frames_of, leave_out_costs, rest_of
 
 from scenes.pins import PinsSpec
 from scenes.sensor import AppearanceSpec, BlobSpec, CameraSpec, PipelineSpec, SensorSpec
@@ -82,7 +82,9 @@ def made(tmp_path_factory):
     images, places = dots(2)
     for k, image in enumerate(images):
         cv2.imwrite(str(folder / f"frame_{k}.png"), image)
-    return new_sensor(folder, folder.with_name("dark.toml")), images, places
+    with pytest.MonkeyPatch.context() as patch:
+        leave_out_costs(patch)
+        return new_sensor(folder, folder.with_name("dark.toml")), images, places
 
 
 def test_a_sensor_of_dark_pins_is_made_checked_and_tuned(made):
@@ -115,6 +117,7 @@ def test_white_skin_around_dark_caps_is_saturated_and_black_caps_are_not(made):
     assert findings["saturation"].verdict is Grade.HEALTHY
 
 
+@pytest.mark.usefixtures("no_assumption_costs")
 def test_thresholded_frames_of_dark_pins_are_recognised(tmp_path):
     images, _ = dots(light=0.0, corner=0.0)
     white = [np.where(image > 130, 255, 0).astype(np.uint8) for image in images]

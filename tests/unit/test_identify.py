@@ -113,9 +113,9 @@ def test_a_layout_whose_pins_fall_together_explains_nothing():
     pins = PinsSpec(rings=3)
     rest = rest_of(pins)
     spots = find_bumps(frames_of(rest, 1)[0], 6.0)
-    assert _match_known(pins, rest, spots).explained > 0.9
+    assert _match_known(pins, rest, [spots])[0].explained > 0.9
     rest[5] = rest[6]
-    assert _match_known(pins, rest, spots).explained == 0.0
+    assert _match_known(pins, rest, [spots])[0].explained == 0.0
 
 
 def test_a_pin_that_the_rim_lacks_may_be_dark_and_is_not_sure():

@@ -257,7 +257,7 @@ def test_a_table_with_a_changed_byte_is_told_or_read_as_it_was(tmp_path, to, fil
     folder = written(tmp_path / "r", to, EPISODES[:1])
     labels = open_recording(folder).labels if to == "lerobot" else {}
     data, told = (folder / file).read_bytes(), 0
-    for place in range(4, len(data), len(data) // 150):
+    for place in range(4, len(data), len(data) // 75):
         (folder / file).write_bytes(data[:place] + bytes([data[place] ^ 4]) + data[place + 1 :])
         try:
             (found,) = open_records(folder).episodes
@@ -266,7 +266,7 @@ def test_a_table_with_a_changed_byte_is_told_or_read_as_it_was(tmp_path, to, fil
                 np.testing.assert_array_equal(column, labels[name])
         except TwinError:
             told += 1
-    assert told > 50
+    assert told > 25
 
 
 def test_a_model_with_a_single_label_is_kept_in_every_format(tmp_path):

@@ -1,5 +1,7 @@
 """Laws of the skin fitted to one frame's pins: rest, states of the mechanics, rotation, lost pins, refusals."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -35,8 +37,9 @@ def fit(straight):
 
 @pytest.fixture(scope="module")
 def states(straight):
+    """Gives the pressed state of a pose by its name; each is solved once, when it is asked for."""
     solver = SkinSolver(straight)
-    return {name: solver.press(load_object("plane"), pose) for name, pose in POSES.items()}
+    return cache(lambda name: solver.press(load_object("plane"), POSES[name]))
 
 
 def seen_centroids(spec, caps_mm, axis):
@@ -59,7 +62,7 @@ def test_no_contact_is_found_as_no_contact(straight, fit):
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "sheared")) for name in POSES])
 def test_a_pressed_skin_is_recovered_from_its_pins(straight, fit, states, name):
     """The fit reproduces the given pins. Depth and axes follow from skin and gel alone, because nothing is known about the object."""
-    pressed, (depth_mm, axis_deg, remainder_px) = states[name], MEDIANS[name]
+    pressed, (depth_mm, axis_deg, remainder_px) = states(name), MEDIANS[name]
     pins_px = seen_centroids(straight, pressed.caps_mm, pressed.axis)
     found = fit(pins_px)
     assert np.abs(seen_centroids(straight, found.caps_mm, found.axis) - pins_px).max() < PIXEL_PX
@@ -73,7 +76,7 @@ def test_a_pressed_skin_is_recovered_from_its_pins(straight, fit, states, name):
 @pytest.mark.slow
 def test_rotated_pins_give_the_rotated_skin(straight, fit, states):
     """A turn by 60 deg permutes the pins of ring i by i places."""
-    state = states["tilted"]
+    state = states("tilted")
     c, s = np.cos(np.pi / 3), np.sin(np.pi / 3)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     first = [1 + 3 * ring * (ring - 1) for ring in range(1, straight.pins.rings + 1)]
@@ -86,7 +89,7 @@ def test_rotated_pins_give_the_rotated_skin(straight, fit, states):
 
 
 def test_lost_pins_follow_the_skin(straight, fit, states):
-    state = states["tilted"]
+    state = states("tilted")
     pins_px = project(straight.view, state.caps_mm)
     lost = np.random.default_rng(0).permutation(len(pins_px))[:30]
     pins_px[lost] = np.nan

@@ -93,6 +93,7 @@ def test_a_folder_of_frames_becomes_a_sensor(made):
     assert "too few frames (4)" in few, few
 
 
+@pytest.mark.usefixtures("no_assumption_costs")
 def test_the_next_steps_name_the_files_and_colour_frames_that_were_thresholded_get_no_light(tmp_path):
     """They can be copied to the command line as they stand."""
     rest = rest_of(PINS)
@@ -285,14 +286,16 @@ def test_a_refused_estimate_of_a_sensor_whose_layout_is_unsure_points_at_the_lay
         assert any("unsure of the layout" in line for line in said) == unsure
 
 
+@pytest.mark.usefixtures("no_assumption_costs")
 def test_a_pin_that_the_nearest_layouts_have_too_many_is_named_by_its_place_and_the_way_out_ends(tmp_path):
     """29 pins: of 5 columns and 6 rows one is missing, of 7 rows more are; neither is given in turn, and corrected pins are sure."""
     rest = rest_of(PinsSpec(layout="grid", columns=5, rows=6))
-    folder = folder_of(tmp_path, frames_of(np.delete(rest, 29, axis=0), 4))
+    images = frames_of(np.delete(rest, 29, axis=0), 2)
+    folder = folder_of(tmp_path, images)
     found = new_sensor(folder, tmp_path / "mine.toml")
     place = re.search(r"no pin is seen at \((\d+), (\d+)\) px", found.lines()[0])
     assert not found.identified.sure and np.linalg.norm(np.array(place.groups(), float) - rest[29]) < 8, found.lines()[0]
-    taller = _compare_layout(PinsSpec(layout="grid", columns=5, rows=7), frames_of(np.delete(rest, 29, axis=0), 4))
+    taller = _compare_layout(PinsSpec(layout="grid", columns=5, rows=7), images)
     (doubt,) = taller.doubts
     assert not taller.sure and doubt.count("no pin is seen at") == 2 and "leave `layout` out" not in doubt, doubt
     (step,) = [line for line in found.next_steps if "pins.csv" in line]
@@ -352,22 +355,26 @@ def test_a_place_that_was_forgotten_is_asked_for():
     assert np.hypot(*(rest_px[left_out] - (x, y))) < usual_spacing(rest_px) / 2
 
 
-def test_frames_of_another_size_are_tuned_and_then_observed():
+@pytest.fixture(scope="module")
+def other_size():
+    """A sensor, frames of another size, pins at rest in them, and the sensor tuned to them."""
     spec = load_sensor("mg400-127")
     rest = rest_of(spec.pins, turn_deg=spec.pins.phase_deg)
     frames = [Frame(image, Form.RAW, f"f{k}") for k, image in enumerate(frames_of(rest, 2))]
+    return spec, frames, rest, with_detector(spec, tune(frames, spec).detector)
+
+
+def test_frames_of_another_size_are_tuned_and_then_observed(other_size):
+    spec, frames, _, tuned = other_size
     with pytest.raises(FrameError, match="expected 640x480"):
         Pipeline(spec, Form.RAW)(frames[0])
-    tuned = with_detector(spec, tune(frames, spec).detector)
     assert (tuned.camera.width_px, tuned.camera.height_px) == SIZE
     assert all(Pipeline(tuned, Form.RAW)(frame).found == 127 for frame in frames)
 
 
-def test_stray_pins_between_caps_are_not_valid():
-    spec = load_sensor("mg400-127")
-    rest = rest_of(spec.pins, turn_deg=spec.pins.phase_deg)
+def test_stray_pins_between_caps_are_not_valid(other_size):
+    _, _, rest, tuned = other_size
     frame = Frame(frames_of(rest, 1, contact_px=1e-9)[0], Form.RAW)
-    tuned = with_detector(spec, tune([frame], spec).detector)
     pipeline = Pipeline(tuned, Form.RAW)
     moved = np.roll(frame.image, int(np.median(pipeline.reference.spacing_px) / 2), axis=1)
     assert pipeline(frame).valid
@@ -427,6 +434,7 @@ FUZZ = {
 SLOW_FUZZ = ("turned", "16 bits", "masked", "colour")
 
 
+@pytest.mark.usefixtures("no_assumption_costs")
 @pytest.mark.parametrize(
     "change", [pytest.param(change, id=name, marks=[pytest.mark.slow] * (name in SLOW_FUZZ)) for name, change in FUZZ.items()]
 )

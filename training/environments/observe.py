@@ -3,16 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import cv2
 import numpy as np
 
 from scenes.sensor import SensorSpec
 from training.data.pins import PinTable, cap_light
-from training.estimate.estimator import PoseEstimator
-from training.models.part import PinModel
-from training.runs.run_files import shipped_names
 from training.surrogate.reading import Backend, ContactReading
 from twin.camera.capture import expose, record
 from twin.camera.projection import project_in_form
@@ -23,6 +20,9 @@ from twin.optics.preview import Preview
 from twin.optics.render import Renderer
 from twin.pins import Pipeline, make_graph, measure_reference, node_features, nominal_reference
 from twin.types import BoolArray, FloatArray, Form, Frame, ImageArray, IntArray, PinState
+
+if TYPE_CHECKING:
+    from training.estimate.estimator import PoseEstimator
 
 Kind = Literal["oracle", "pins", "graph", "image", "pose"]
 KINDS: tuple[str, ...] = get_args(Kind)
@@ -104,11 +104,9 @@ class Eye:
     def __init__(self, sensor: SensorSpec, count: int, kind: Kind, *, pictures: Pictures, pin_noise_px: float) -> None:
         self.sensor, self.kind, self.pictures, self._noise_px = sensor, kind, pictures, pin_noise_px
         self._estimator: PoseEstimator | None = None
+        self._sees_light = False
         if kind == "pose":
-            if sensor.name not in shipped_names():
-                known = ", ".join(shipped_names())
-                raise OptionError(f"observation 'pose' needs shipped weights; {sensor.name} has none (there are those of {known} have)")
-            self._estimator = PoseEstimator.load(sensor.name)
+            self._estimator, self._sees_light = _load_estimator(sensor)
             if self._sees_light and pictures == "none":
                 raise OptionError(f"observation 'pose': the weights of {sensor.name} also need the light on caps; give pictures='preview'")
         self.form = self._estimator.form if self._estimator else Form.PROCESSED if sensor.recording else Form.RAW
@@ -116,12 +114,6 @@ class Eye:
         self._spacing = float(self.reference.spacing_px.mean())
         self._nominal = SensorView(sensor, self.form, pictures)
         self._views: list[SensorView] = [self._nominal] * count
-
-    @property
-    def _sees_light(self) -> bool:
-        """Whether the estimator uses the light on the caps."""
-        part = None if self._estimator is None else self._estimator.part
-        return isinstance(part, PinModel) and part.sees_light
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -210,6 +202,19 @@ class Eye:
         scale = np.array([POSE_SCALES[unit] for unit in self._estimator.units])
         known = np.nan_to_num(np.asarray(executed, float).reshape(len(value), 1), nan=1.0)
         return np.clip(np.concatenate([value / scale, known], axis=1), -LARGEST, LARGEST).astype(np.float32)
+
+
+def _load_estimator(sensor: SensorSpec) -> tuple["PoseEstimator", bool]:
+    """The shipped estimator of a sensor, and whether it uses the light on the caps."""
+    from training.estimate.estimator import PoseEstimator  # loads torch, which other observations do not need
+    from training.models.part import PinModel
+    from training.runs.run_files import shipped_names
+
+    if sensor.name not in shipped_names():
+        known = ", ".join(shipped_names())
+        raise OptionError(f"observation 'pose' needs shipped weights; {sensor.name} has none (there are those of {known} have)")
+    found = PoseEstimator.load(sensor.name)
+    return found, isinstance(found.part, PinModel) and found.part.sees_light
 
 
 def _painter(sensor: SensorSpec, form: Form, pictures: Pictures) -> Callable[[PinState, np.random.Generator], Frame]:

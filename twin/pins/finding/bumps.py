@@ -5,6 +5,8 @@ compared with its root mean square nearby, so that caps in a dark corner have th
 longer than wide (arcs of the housing, scratches) are left out.
 """
 
+import hashlib
+from collections import OrderedDict
 from dataclasses import dataclass
 
 import cv2
@@ -46,6 +48,8 @@ GLINT_SIZE = 1.6
 """Radius of a disc with the area of the largest glint, in standard deviations of the narrower Gaussian."""
 GLINT_RIM = 0.6
 """Width of a glint's blurred rim, in standard deviations of the narrower Gaussian. The rim is removed together with the glint."""
+KEPT = 128
+"""Number of results that are kept."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +102,19 @@ def find_bumps(gray: np.ndarray, sigma_px: float) -> Bumps:
     height: np.ndarray = response[rows, columns][round_enough].astype(float)
     kept = _not_far_below(px, height)
     return Bumps(px[kept], height[kept], sigma_px, (gray.shape[1], gray.shape[0]))
+
+
+_recent: OrderedDict[tuple[bytes, tuple[int, ...], float], Bumps] = OrderedDict()
+
+
+def recent_bumps(gray: np.ndarray, sigma_px: float) -> Bumps:
+    """As ``find_bumps``; the last results are kept, because the same frames are compared with several layouts."""
+    key = hashlib.blake2b(np.ascontiguousarray(gray).data).digest(), gray.shape, sigma_px
+    found = _recent.pop(key, None) or find_bumps(gray, sigma_px)
+    _recent[key] = found
+    while len(_recent) > KEPT:
+        _recent.popitem(last=False)
+    return found
 
 
 def without_glints(gray: np.ndarray, sigma_px: float) -> np.ndarray:

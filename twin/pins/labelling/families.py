@@ -25,9 +25,11 @@ LAID_SCALES = (1.0, 0.93, 1.07, 0.86, 1.15)
 """Sizes of a layout of given positions when it is laid over the spots, relative to the size of the pattern of spots."""
 LAID_GATE = 0.3
 """Largest distance of a spot from a place of the layout laid over it, in spacings, at which the spot gets a first label."""
+KEPT = 512
+"""Number of labellings that are kept."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Family:
     """A lattice by which spots are labelled.
 
@@ -72,22 +74,27 @@ def family_of_positions(pins: PinsSpec) -> Family:
 
 def label_spots(found: Bumps, by: Family) -> np.ndarray | None:
     """The labelling (M,) that holds most spots of a frame: the spot of each place, -1 for no spot. None if no labelling is found."""
-    if len(found.px) < LEAST_GROWN:
-        return None
+    return None if len(found.px) < LEAST_GROWN else _label_places(found.px.tobytes(), by)
+
+
+@lru_cache(maxsize=KEPT)
+def _label_places(spots: bytes, by: Family) -> np.ndarray | None:
+    """The labelling (M,) of spots (K, 2), float64. It is kept, because the same frames are compared with several layouts."""
+    px = np.frombuffer(spots).reshape(-1, 2).copy()
     best, most = None, LEAST_GROWN - 1
-    for start, cell in _starts(found, by, by.kind) if by.kind else _lay_lattice(found, by):
-        labels = grow(by.lattice, by.around, found.px, start, cell)
+    for start, cell in _starts(px, by, by.kind) if by.kind else _lay_lattice(px, by):
+        labels = grow(by.lattice, by.around, px, start, cell)
         count = int((labels >= 0).sum())
         if count > most:
             best, most = labels, count
-        if most >= NEARLY_ALL * len(found.px):
+        if most >= NEARLY_ALL * len(px):
             break
     return best
 
 
-def _starts(found: Bumps, by: Family, kind: type[LatticeLayout]) -> Iterator[tuple[np.ndarray, float]]:
+def _starts(px: np.ndarray, by: Family, kind: type[LatticeLayout]) -> Iterator[tuple[np.ndarray, float]]:
     """First labels (M,) and the spots' distance, px: a spot and its nearest spots, beginning with the one nearest to the x direction."""
-    px, (least, most), (middle, places) = found.px, kind.gaps_deg, kind.start()
+    (least, most), (middle, places) = kind.gaps_deg, kind.start()
     distance, near = cKDTree(px).query(px, k=kind.corners + 1)
     away = np.linalg.norm(px - np.median(px, axis=0), axis=1)
     for spot in np.argsort(away)[: kind.seeds]:
@@ -106,9 +113,8 @@ def _starts(found: Bumps, by: Family, kind: type[LatticeLayout]) -> Iterator[tup
         yield start, float(np.median(reach))
 
 
-def _lay_lattice(found: Bumps, by: Family) -> Iterator[tuple[np.ndarray, float]]:
+def _lay_lattice(px: np.ndarray, by: Family) -> Iterator[tuple[np.ndarray, float]]:
     """First labels (M,) and the spacing, px: the lattice, laid over the spots by middle, size and turn, labels spots nearby."""
-    px = found.px
     tree = cKDTree(px)
     low, high = np.percentile(px, [2, 98], axis=0)
     inside = px[((px >= low) & (px <= high)).all(axis=1)]

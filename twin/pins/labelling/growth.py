@@ -149,6 +149,7 @@ def grow(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, start: np.ndar
     return spot
 
 
+@compiled()
 def locate_places(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, spot: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
     """Positions (M, 2), px, of a lattice's places: of the spots, or predicted from labelled neighbours; NaN without a prediction.
 
@@ -157,9 +158,9 @@ def locate_places(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, spot:
     out = np.full((len(lattice), 2), np.nan)
     for i in range(len(lattice)):
         if spot[i] >= 0:
-            out[i] = px[spot[i]]
+            out[i, 0], out[i, 1] = px[spot[i], 0], px[spot[i], 1]
         else:
             x, y, _, count = predict_place(i, lattice, around, spot, px)
-            if count and -size_px[0] < x < 2 * size_px[0] and -size_px[1] < y < 2 * size_px[1]:
-                out[i] = x, y
+            if count > 0 and -size_px[0] < x < 2 * size_px[0] and -size_px[1] < y < 2 * size_px[1]:
+                out[i, 0], out[i, 1] = x, y
     return out

@@ -24,7 +24,7 @@ from twin.errors import FrameError, format_count
 from twin.frames import spread_indices
 from twin.frames.forms import is_two_level, levels_at, pin_levels
 from twin.geometry.pins import namings, pin_lattice, usual_spacing
-from twin.pins.finding.bumps import Bumps, find_bumps
+from twin.pins.finding.bumps import Bumps, recent_bumps
 from twin.pins.labelling.extent import filled_area, find_beyond, in_view, open_sides, with_view
 from twin.pins.labelling.families import Family, families, family, family_of_positions, label_spots
 from twin.pins.labelling.growth import locate_places
@@ -390,7 +390,7 @@ def _score_layout(pins: PinsSpec, by: Family, images: list[np.ndarray]) -> Candi
 def _spots(images: list[np.ndarray], sigma_px: float) -> list[Bumps]:
     """Each frame's spots of one size, with the area that a mask hides in all frames."""
     filled = filled_area(images)
-    found = [find_bumps(image, sigma_px) for image in images]
+    found = [recent_bumps(image, sigma_px) for image in images]
     hidden = with_view(found[0], filled).hidden
     return [replace(one, hidden=hidden) for one in found]
 
@@ -399,7 +399,7 @@ def _best_size(image: np.ndarray, looks: list[Look]) -> float | None:
     """The size of spots with the most pins seen, minus pins not seen and left-over spots; None if no layout is seen."""
     best, most = None, 0
     for size in (share * max(image.shape) for share in SIZES):
-        spots = find_bumps(image, size)
+        spots = recent_bumps(image, size)
         for look in looks:
             seen = look(spots)
             if seen is not None:
@@ -478,11 +478,11 @@ def _as_layout(pins: PinsSpec, by: Family, spots: Bumps, spot: np.ndarray) -> La
 def _candidate(pins: PinsSpec, seen: list[LayoutInFrame], spots: list[Bumps], *, may_miss: bool = True) -> Candidate:
     """Match a layout to all frames. The start is ``seen``: the layout in those frames in which it was found without the others."""
     rest = _rest(pins, _turned_alike(pins, seen))
-    again = [_match_known(pins, rest, one) for one in spots]
+    again = _match_known(pins, rest, spots)
     good = [k for k, one in enumerate(again) if one.explained > LEAST_EXPLAINED]
     if good:
         rest = _at_likelier_spots(pins, _rest(pins, [again[k] for k in good]), [again[k] for k in good])
-        again = [_match_known(pins, rest, one) for one in spots]
+        again = _match_known(pins, rest, spots)
     there = np.mean([np.isfinite(one.pins_px[:, 0]) for one in again], axis=0)
     shown = np.mean([in_view(one.places_px, a) for one, a in zip(again, spots, strict=True)], axis=0) > STEADY
     never = np.flatnonzero((there < NEVER_SEEN) & shown)
@@ -552,13 +552,16 @@ def unnamed_spots(rest_px: np.ndarray, seen: Sequence[LayoutInFrame]) -> list[np
     return places
 
 
-def _match_known(pins: PinsSpec, rest_px: np.ndarray, spots: Bumps) -> LayoutInFrame:
-    """Match a layout with known pins at rest (N, 2), px, to a frame's spots."""
+def _match_known(pins: PinsSpec, rest_px: np.ndarray, spots: Sequence[Bumps]) -> list[LayoutInFrame]:
+    """Match a layout with known pins at rest (N, 2), px, to the spots of frames."""
     if not spread_out(rest_px) or together(rest_px).any():
-        return _make_layout_result(spots, np.full(pins.count, -1), rest_px)
-    found = match(make_reference(rest_px, pins), spots.px, np.ones(len(spots.px)))
-    places = np.where((found.blob >= 0)[:, None], spots.px[found.blob] if len(spots.px) else np.nan, found.predicted_px)
-    return _make_layout_result(spots, found.blob, np.where(np.isfinite(places), places, rest_px))
+        return [_make_layout_result(one, np.full(pins.count, -1), rest_px) for one in spots]
+    reference, results = make_reference(rest_px, pins), []
+    for one in spots:
+        found = match(reference, one.px, np.ones(len(one.px)))
+        places = np.where((found.blob >= 0)[:, None], one.px[found.blob] if len(one.px) else np.nan, found.predicted_px)
+        results.append(_make_layout_result(one, found.blob, np.where(np.isfinite(places), places, rest_px)))
+    return results
 
 
 def symmetries(pins: PinsSpec) -> list[np.ndarray]:

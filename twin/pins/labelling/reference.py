@@ -177,7 +177,8 @@ def project_rest(spec: SensorSpec, form: Form) -> np.ndarray:
 
 def _turned_alike(px: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Triangles (t, 3) over points (N, 2), turned over where their area is negative."""
-    negative = np.array([_double_area(px, each) < 0 for each in triangles], bool)
+    (ax, ay), (bx, by), (cx, cy) = px[triangles].transpose(1, 2, 0)
+    negative = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax) < 0
     return np.where(negative[:, None], triangles[:, ::-1], triangles)
 
 

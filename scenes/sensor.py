@@ -17,8 +17,6 @@ from scenes.rig import RigSpec
 
 Polarity = Literal["bright", "dark"]
 """Whether caps are brighter or darker than the skin around them."""
-UNSURE_LAYOUT = "The layout of the pins is unsure"
-"""Sentence in the description of a specification that was made from frames which do not decide the layout."""
 ELSEWHERE = "leave it out if it was measured on another layout"
 """Remedy in the error for measured values of caps that do not fit the layout."""
 
@@ -659,6 +657,8 @@ class SensorSpec(Section):
         The window behind the gel.
     pins : PinsSpec
         Layout and size of the pins.
+    layout_unsure : bool
+        Whether the specification was made from frames that do not decide the layout.
     camera : CameraSpec
         Position and projection of the camera.
     leds : LedRingSpec
@@ -680,6 +680,7 @@ class SensorSpec(Section):
     name: Name
     description: str = ""
     source: str = ""
+    layout_unsure: bool = False
     skin: SkinSpec = SkinSpec()
     gel: GelSpec = GelSpec()
     lens: LensSpec = LensSpec()

@@ -13,7 +13,6 @@ from unknown_sensor import RADIUS, SIZE, frames_of, rest_of
 
 from scenes import load_sensor
 from scenes.pins import PinsSpec, layout_from
-from scenes.sensor import UNSURE_LAYOUT
 from training.estimate.estimator import PoseEstimator
 from training.studies.evaluation import predict_frames
 from twin.calibration.camera_pose import CameraReport
@@ -278,8 +277,7 @@ def test_a_refused_estimate_of_a_sensor_whose_layout_is_unsure_points_at_the_lay
     for unsure in (False, True):
         predictions = predict_frames("mg400-127", tmp_path)
         sensor = predictions.estimator.sensor
-        description = f"{sensor.description} {UNSURE_LAYOUT}" if unsure else sensor.description
-        predictions.estimator.sensor = sensor.model_copy(update={"description": description})
+        predictions.estimator.sensor = sensor.alter(layout_unsure=unsure)
         said = []
         with pytest.raises(FrameError, match="none of 1 frame gave a pose"):
             for line in predictions.lines():

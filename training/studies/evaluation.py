@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from scenes.sensor import UNSURE_LAYOUT
 from training.data.dataset import Dataset, join_datasets, load_dataset
 from training.data.simulated import is_simulated
 from training.errors import TrainingError
@@ -279,7 +278,7 @@ class Predictions:
         for bad in self.recording.failed:
             yield f"skipped {bad['image_name']}: {bad['reason']}"
             reasons.append(f"{bad['image_name']}: {bad['reason']}")
-        if reasons and UNSURE_LAYOUT in self.estimator.sensor.description:
+        if reasons and self.estimator.sensor.layout_unsure:
             yield "note: 'twin new' was unsure of the layout of this sensor's pins, which may be why: decide it, and train again"
         if not poses:
             given = format_count(len(self.recording), "frames")

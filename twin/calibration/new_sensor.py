@@ -8,7 +8,7 @@ from scipy.spatial import Delaunay
 
 from scenes.layouts.base import LatticeLayout
 from scenes.pins import PinsSpec
-from scenes.sensor import UNSURE_LAYOUT, AppearanceSpec, BlobSpec, CameraSpec, PipelineSpec, Polarity, SensorSpec
+from scenes.sensor import AppearanceSpec, BlobSpec, CameraSpec, PipelineSpec, Polarity, SensorSpec
 from twin.calibration.assumptions import AssumptionCost, cost_of_assumptions
 from twin.calibration.camera_pose import LEAST_PINS, MODEL_PX, CameraReport, fit_camera
 from twin.calibration.sensor_file import sibling_folder, write_sensor
@@ -239,7 +239,7 @@ def new_sensor(
             ) from error
         start = _start_specification(out.stem, looked[0], best.pins, rest, frames.name, polarity)
         start = start if radius_mm is None else of_radius(start, radius_mm)
-        start = start if found.sure else start.alter(description=f"{start.description}. {UNSURE_LAYOUT}")
+        start = start.alter(layout_unsure=not found.sure)
         with stage(progress, "camera"):
             sizes_px = _sizes(best, images) if looked[0].form == Form.RAW else None
             fitted, camera, others = _camera(start, np.where((best.there >= STEADY)[:, None], rest.pins_px, np.nan), rest.source, sizes_px)

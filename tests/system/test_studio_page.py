@@ -268,8 +268,9 @@ def until(true):
         time.sleep(0.02)
 
 
-def test_a_recording_is_shown_with_labels_doubts_and_the_twins_picture(client, tmp_path):
+def test_a_recording_is_shown_with_labels_doubts_and_the_twins_picture(studio, client, tmp_path):
     folder = write_recording(tmp_path / "recording", load_sensor(SENSOR), 3)
+    until(lambda: studio.twin.contact.model is not None)
     client.set("mode", "Recording")
     client.set("folder or video", str(tmp_path / "nothing"))
     client.set("Open", True)

@@ -292,8 +292,7 @@ def test_actions_that_are_no_numbers_are_refused_and_move_nothing(task, size):
 
 def test_a_scripted_controller_inserts_pegs_by_what_the_sensors_feel():
     env = gymnasium.make("tactip/PegInsert-v0", observation="none").unwrapped
-    solved = 0
-    for seed in range(5):
+    for seed in (0, 1):
         _, start = env.reset(seed=seed)
         assert np.linalg.norm(start["off_mm"]) <= 5 and abs(start["tilt_deg"]) <= 5
         expert, over, rewards = Expert(env), False, []
@@ -303,8 +302,7 @@ def test_a_scripted_controller_inserts_pegs_by_what_the_sensors_feel():
             over = failed or late
             assert failed or info["is_success"] or reward == pytest.approx(sum(info["terms"].values()))
         assert min(rewards[:-1]) >= 0 and max(rewards[:-1]) <= 1
-        solved += info["is_success"]
-    assert solved >= 4
+        assert info["is_success"]
 
 
 def test_a_peg_that_is_pushed_down_without_feeling_often_misses():

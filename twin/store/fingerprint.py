@@ -154,6 +154,7 @@ def _file_of(root: Path, name: str) -> Path | None:
     return Path(file) if file and Path(file).is_file() else None
 
 
+@cache
 def _source(root: Path, name: str) -> Path | None:
     """File of a module, or of a package's ``__init__``; None if there is none."""
     place = root.joinpath(*name.split("."))

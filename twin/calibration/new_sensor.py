@@ -540,7 +540,8 @@ def _describe_result(
     else:
         made = f"twin dataset --experiment surface-2d --sensor {out} --count 200 --images none --randomise contact --out sim"
         trained = f"twin train --model vgnn --sensor {out} --data sim --out runs/mine"
-        steps.append(f"train a first model in the twin, without labels: {made}; {trained}; twin live --camera 0 --model runs/mine (with `count` 1000 it is more accurate)")
+        shown = "twin live --camera 0 --model runs/mine (with 1000 contacts it is more accurate)"
+        steps.append(f"train a first model in the twin, without labels: {made}; {trained}; {shown}")
         steps.append("or record labelled contacts (a table targets.csv beside the frames), then 'twin calibrate contact' and 'twin train'")
     if sensor.camera.channels == "color" and recording.form is Form.RAW and found.polarity == "bright":
         steps.append(f"fit light and colours: twin calibrate optics {files}")

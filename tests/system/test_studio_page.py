@@ -288,6 +288,22 @@ def test_a_recording_is_shown_with_labels_doubts_and_the_twins_picture(studio, c
     client.set("mode", "Twin")
 
 
+def test_a_recording_that_was_opened_before_its_model_was_loaded_gets_estimates(studio, client, tmp_path):
+    folder = write_recording(tmp_path / "recording", load_sensor(SENSOR), 1)
+    contact = studio.twin.contact
+    until(lambda: contact.model is not None)
+    model, contact.model = contact.model, None
+    client.set("mode", "Recording")
+    client.set("folder or video", str(folder))
+    client.set("Open", True)
+    wait_html(client, "no estimates: there is no model")
+    contact.use(model)
+    studio.twin.worker.show_again()
+    until(lambda: "no estimates" not in client.html())
+    assert "1 of 1" in client.html()
+    client.set("mode", "Twin")
+
+
 def connect_live(client, folder, arm):
     """Connect the mode Live to the frames of a folder, and to an arm."""
     client.set("mode", "Live")

@@ -83,9 +83,9 @@ class Studio:
         self.page = StudioPage(heading(plan.state), host=plan.host, port=plan.port, modes=titles, saves=plan.out)
         self.twin = TwinMode(self.page, plan.state, plan.out, model_of, traces=plan.traces)
         degrade = DegradeMode(self.page, self.twin)
-        self.twin.followers.append(degrade.follow)
         live = live_mode(self.page, self.twin, plan)
         recording, new = RecordingMode(self.page, self.twin, plan.recording), NewMode(self.page, self.twin, plan.out)
+        self.twin.followers += [degrade.follow, recording.follow]
         self.modes: list[PageMode] = [self.twin, degrade, recording, live, new]
         self.page.set_modes(self.modes)
 

@@ -82,7 +82,8 @@ class RecordingView:
             self._labels = read_arm_labels(self.recording)
         except FrameError as error:
             self.notes.append(str(error))
-        self._model = self._fitting(contact.model)
+        self.given = contact.model
+        self._model = self._fitting(self.given)
         self._experiment: ExperimentSpec | None = None if self._model is None else experiment_of(self._model)
         self._rig: RigContact | None = None
 
@@ -226,10 +227,17 @@ class RecordingMode(PageMode):
             put(self._number, int(np.clip(index, 0, len(self._view) - 1)))
             self._wanted.give(int(self._number.value))
 
+    def follow(self, answer: object) -> None:
+        """Show the frame again, with estimates, if the twin has loaded a model since it was opened."""
+        if self._view is not None and self._view.given is not self._view.contact.model:
+            self._wanted.give(int(self._number.value))
+
     def _show(self, index: int) -> None:
         view = self._view
         if view is None or not self._active:
             return
+        if view.given is not view.contact.model:  # it was loaded after the recording was opened
+            view = self._view = RecordingView(view.recording.path, view.contact)
         looked = self._next_doubt(view) if index < 0 else view.look(index)
         if looked is None:
             return

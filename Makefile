@@ -29,7 +29,7 @@ demo: setup      ## the main job: press, render, detect, graph; pictures and a p
 	@$(BIN)/twin demo --out $(OUT) $(if $(filter $(DEMO),$(OUT)),--force)
 
 test: setup      ## run the tests; at the end which took longest
-	@$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --durations=15 --durations-min=1
+	@$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --durations=15 --durations-min=1
 
 golden: setup    ## make the golden renders anew (after a wanted change of the pictures; look at them in out/golden)
 	@$(SCRIPT) tests/golden/make.py --pictures out/golden

@@ -4,6 +4,7 @@ import gc
 import os
 import signal
 import sys
+from collections import Counter
 from pathlib import Path
 
 # One thread for linear algebra, here and in the processes that tests start: the tests themselves run side by side, and threads that wait
@@ -49,6 +50,19 @@ def pytest_collection():
         gc.freeze()
         gc.set_threshold(10_000)
         gc.enable()
+
+
+def pytest_collection_modifyitems(items):
+    """In a run of several workers, files of devices' tests, which wait, come between those that compute: so all cores are busy to the end."""
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        return
+    count = Counter(item.path for item in items)
+    few_last = sorted(count, key=lambda path: (path.parent.name == "unit", -count[path]))
+    place = {}
+    for waits in (True, False):
+        group = [path for path in few_last if (path.parent.name == "contract") == waits]
+        place |= {path: (k + 0.5) / len(group) for k, path in enumerate(group)}
+    items.sort(key=lambda item: place[item.path])
 
 
 @pytest.fixture(scope="session")

@@ -53,7 +53,7 @@ def pytest_collection():
 
 
 def pytest_collection_modifyitems(items):
-    """In a run of several workers, files of devices' tests, which wait, come between those that compute: so all cores are busy to the end."""
+    """With several workers, files of tests of devices, which wait, come between those that compute: so all cores are busy to the end."""
     if "PYTEST_XDIST_WORKER" not in os.environ:
         return
     count = Counter(item.path for item in items)

@@ -4,8 +4,8 @@ BIN := $(VENV)/bin
 DEMO := out/demo
 OUT ?= $(DEMO)
 export TACTIP_REAL ?= ../shared/real
-# one more than cores, because tests of devices often wait
-WORKERS ?= $(shell expr $$(nproc) + 1)
+# two more than cores, because tests of devices often wait
+WORKERS ?= $(shell expr $$(nproc) + 2)
 SCRIPT := PYTHONPATH=$(CURDIR):$(CURDIR)/tests:$(CURDIR)/tests/helpers:$(CURDIR)/tests/bench $(BIN)/python
 
 .PHONY: help setup demo test golden bench figures film browser gallery tables docs validate lint types wheel clean

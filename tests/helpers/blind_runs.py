@@ -181,7 +181,6 @@ def program(
     if kind.startswith("ros2"):  # its emulator has no scale of time
         servo = servo.model_copy(update={"linear_mm_s": scale * servo.linear_mm_s, "angular_deg_s": scale * servo.angular_deg_s})
         limits = limits.model_copy(update={"retreat_mm_s": scale * limits.retreat_mm_s})
-    if kind.startswith("ros2"):
         device = Ros2Arm(kind[5:], namespace=place)
         hold = device._hold
         device._hold = lambda *why, **how: (stops is not None and stops.append(time.monotonic()), hold(*why, **how))
@@ -241,7 +240,7 @@ def measure(seed: int, case: tuple[str, str, str] | None = None, kind: str = "mg
         process = None
         if fault == KILLED:
             words = f"import sys; sys.path[:0] = {sys.path!r}; from pathlib import Path; from blind_runs import program"
-            call = f"program({kind!r}, {command!r}, {place!r}, {camera.url!r}, Path({str(folder / 'data')!r}), scale={scale})()"
+            call = f"program({kind!r}, {command!r}, {place!r}, {camera.url!r}, Path({str(folder / 'data')!r}))()"
             process = subprocess.Popen([sys.executable, "-c", f"{words}; {call}"], stderr=subprocess.DEVNULL)
             thread = threading.Thread(target=lambda: (process.wait(), done.set()), daemon=True)
         else:

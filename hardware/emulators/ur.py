@@ -160,6 +160,7 @@ class UrController:
     def answer(self, request: str) -> str:
         """The dashboard's answer to a request."""
         words = {"polyscopeversion": "3.15.8.106339", "get robot model": "UR5", "close safety popup": "closing safety popup"}
+        words["running"] = f"Program running: {str(self.runtime_state == PLAYING).lower()}"
         acts = {
             "stop": (self.end_program, "Stopped"),
             "power on": (lambda: self.power(max(self.robot_mode, IDLE)), "Powering on"),

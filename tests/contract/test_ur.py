@@ -229,7 +229,7 @@ def test_the_arms_own_watchdog_stops_it_if_nobody_is_left(arm, emulator):
     await_that(lambda: not emulator.arm.busy())
     assert not emulator.arm.enabled and np.linalg.norm(emulator.pose()[:3] - AWAY[:3]) > 50.0
     client.kill()
-    with pytest.raises(DeviceError, match="can't be stopped"):
+    with pytest.raises(DeviceError, match="ended over the dashboard, so it stands"):
         arm.disconnect()
 
 

@@ -162,6 +162,20 @@ def test_an_emergency_stop_needs_no_client(emulator):
     arm.disconnect()
 
 
+def test_a_program_is_ended_over_the_dashboard_if_the_client_has_died(emulator):
+    def lose_the_client(arm):
+        arm.enable()
+        arm.set_speed(20.0, 20.0)
+        arm.move_linear(arm.state().pose + [0, 0, 30, 0, 0, 0], wait=False)
+        arm._client.end()
+        with pytest.raises(DeviceError, match="ended over the dashboard, so it stands"):
+            arm.stop()
+        assert stands_free(emulator, 0.0)
+        raise DeviceError("it is lost")
+
+    assert "Press its emergency stop" not in failure(emulator, lose_the_client)
+
+
 def test_an_mg400_whose_enabling_fails_is_disabled(monkeypatch):
     with Mg400Emulator(port_offset=None) as emulator:
         arm = mg400_of(emulator)

@@ -201,11 +201,25 @@ class UR(BaseArm):
             if self._under_way or self.is_connected:  # otherwise it stood, and its controller has answered
                 self._require_shown(obeyed, STOP_S, "does not obey a stop")
         except DeviceError as error:
-            with contextlib.suppress(DeviceError):
-                self._tell("stop")
+            ended = self._end_program()
+            if ended and not self.is_connected:  # the controller's word, where feedback has ended
+                self._enabled = self._unstopped = self._under_way = False
+                raise type(error)(f"{error}. Its control program was ended over the dashboard, so it stands") from error
             watchdog = f"Without the link its watchdog stops it after {1 / WATCHDOG_HZ:g} s"
             raise type(error)(f"{self.name}: can't be stopped and may move. Press its emergency stop! {watchdog}. {error}") from error
         self._unstopped = self._under_way = False
+
+    def _end_program(self) -> bool:
+        """End the control program over the dashboard; returns whether the controller says that none runs."""
+        until_s = time.monotonic() + STOP_S
+        with contextlib.suppress(DeviceError):
+            self._tell("stop")
+            while self._tell("running").lower() != "program running: false":
+                if time.monotonic() > until_s:
+                    return False
+                time.sleep(POLL_S)
+            return True
+        return False
 
     def _ask(self, method: str, *arguments: Any, timeout_s: float = REPLY_S) -> Any:
         lost = lambda error: DeviceNotConnectedError(f"{self.name}: {method}: {error}; call connect()")  # noqa: E731

@@ -4,8 +4,10 @@ BIN := $(VENV)/bin
 DEMO := out/demo
 OUT ?= $(DEMO)
 export TACTIP_REAL ?= ../shared/real
-# two more than cores, because tests of devices often wait
-WORKERS ?= $(shell expr $$(nproc) + 2)
+# workers of tests that compute, and of tests of devices, which often wait
+WORKERS ?= $(shell nproc)
+DEVICES ?= $(shell expr $$(nproc) + 1)
+PYTEST := $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder --durations=15 --durations-min=1
 SCRIPT := PYTHONPATH=$(CURDIR):$(CURDIR)/tests:$(CURDIR)/tests/helpers:$(CURDIR)/tests/bench $(BIN)/python
 
 .PHONY: help setup demo test golden bench figures film browser gallery tables docs validate lint types wheel clean
@@ -28,8 +30,11 @@ $(VENV)/.installed: pyproject.toml requirements.lock
 demo: setup      ## the main job: press, render, detect, graph; pictures and a page in out/demo, or in OUT=DIR
 	@$(BIN)/twin demo --out $(OUT) $(if $(filter $(DEMO),$(OUT)),--force)
 
-test: setup      ## run the tests; at the end which took longest
-	@$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --durations=15 --durations-min=1
+# What computes leaves the cores to devices, which are watched by the clock.
+test: setup      ## run the tests: those of devices and, beside them, those that compute, which report afterwards
+	@$(SCRIPT) tests/helpers/compiling.py
+	@log=$$(mktemp); nice $(PYTEST) -n $(WORKERS) tests --ignore tests/contract --ignore tests/live >$$log 2>&1 & beside=$$!; failed=0; \
+	$(PYTEST) -n $(DEVICES) tests/contract tests/live || failed=1; wait $$beside || failed=1; cat $$log; rm -f $$log; exit $$failed
 
 golden: setup    ## make the golden renders anew (after a wanted change of the pictures; look at them in out/golden)
 	@$(SCRIPT) tests/golden/make.py --pictures out/golden

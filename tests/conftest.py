@@ -20,7 +20,6 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
 import pytest  # noqa: E402
-from compiling import compile_all  # noqa: E402
 from hypothesis import settings  # noqa: E402
 from threadpoolctl import threadpool_limits  # noqa: E402
 
@@ -32,12 +31,6 @@ threadpool_limits(1)  # where a plugin of pytest has imported numpy before the v
 settings.register_profile("same", derandomize=True)
 settings.register_profile("anew", derandomize=False)
 settings.load_profile("same")
-
-
-def pytest_sessionstart(session):
-    """Before workers start, compile what most of them need, once: each would do so for itself (a CPU minute)."""
-    if getattr(session.config.option, "numprocesses", None):
-        compile_all()
 
 
 @pytest.hookimpl(wrapper=True)
@@ -53,16 +46,9 @@ def pytest_collection():
 
 
 def pytest_collection_modifyitems(items):
-    """With several workers, files of tests of devices, which wait, come between those that compute: so all cores are busy to the end."""
-    if "PYTEST_XDIST_WORKER" not in os.environ:
-        return
+    """Tests of whole programs come first, and files with few tests last: so all workers end at the same time."""
     count = Counter(item.path for item in items)
-    few_last = sorted(count, key=lambda path: (path.parent.name == "unit", -count[path]))
-    place = {}
-    for waits in (True, False):
-        group = [path for path in few_last if (path.parent.name == "contract") == waits]
-        place |= {path: (k + 0.5) / len(group) for k, path in enumerate(group)}
-    items.sort(key=lambda item: place[item.path])
+    items.sort(key=lambda item: (item.path.parent.name == "unit", -count[item.path], item.path))
 
 
 @pytest.fixture(scope="session")

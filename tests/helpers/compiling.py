@@ -43,4 +43,4 @@ def compile_all() -> None:
 
 
 if __name__ == "__main__":
-    globals()[sys.argv[1]]()
+    globals()[sys.argv[1] if len(sys.argv) > 1 else "compile_all"]()

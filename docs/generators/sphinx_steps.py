@@ -6,6 +6,7 @@ from typing import Any
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
+from sphinx import addnodes
 from sphinx.application import Sphinx
 
 from generators import api, commands, notebooks, specifications
@@ -19,6 +20,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
     app.add_html_math_renderer("mathml", (_inline_formula, None), (_displayed_formula, None))
     app.connect("builder-inited", _write_references)
     app.connect("source-read", _name_notebook)
+    app.connect("html-page-context", _draw_titles_only, priority=100)  # before the theme draws its navigation
     app.connect("build-finished", _write_notebooks)
     return {"parallel_read_safe": True}
 
@@ -52,6 +54,27 @@ def _name_notebook(app: Sphinx, name: str, source: list[str]) -> None:
         title, _, rest = source[0].partition("\n")
         stem = name.rpartition("/")[2]
         source[0] = f"{title}\n\n<p><a class='notebook' href='{stem}.ipynb' download>This page as a notebook</a></p>\n{rest}"
+
+
+def _draw_titles_only(app: Sphinx, name: str, template: str, context: dict[str, Any], page: nodes.document | None) -> None:
+    """The navigation shows titles alone. For each page, Sphinx would copy all headings of all pages and drop them: half of its time."""
+    env, draw = app.env, context["toctree"]
+
+    def titles(toc: nodes.bullet_list) -> nodes.bullet_list:
+        if next(toc.findall(addnodes.toctree), None) is not None:
+            return toc
+        short = nodes.bullet_list()
+        short += [nodes.list_item("", item[0].deepcopy()) for item in toc]
+        return short
+
+    def draw_titles(**options: Any) -> str:
+        whole, env.tocs = env.tocs, {page: titles(toc) for page, toc in env.tocs.items()}
+        try:
+            return draw(**options)
+        finally:
+            env.tocs = whole
+
+    context["toctree"] = draw_titles
 
 
 def _write_notebooks(app: Sphinx, error: Exception | None) -> None:

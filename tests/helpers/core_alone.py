@@ -1,4 +1,6 @@
-"""Runs commands where nothing but the core is installed: no module of an extra is found. Prints the exit code of each, and what it says.
+"""Runs commands in one process; as a program, where nothing but the core is installed: no module of an extra is found.
+
+It prints the exit code of each, and its errors.
 
 python core_alone.py COMMAND... (each in quotes)
 """
@@ -21,18 +23,18 @@ class CoreFinder(PathFinder):
         return None if fullname.partition(".")[0] in {*EXTRAS, "filelock"} else super().find_spec(fullname, path, target)
 
 
-def run(command: str) -> tuple[int, str]:
-    """Exit code of a command, and its errors."""
+def run(command: str) -> tuple[int, str, str]:
+    """Exit code of a command, what it printed, and its errors."""
     sys.argv = ["twin", *command.split()]
-    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()) as said:
+    with redirect_stdout(io.StringIO()) as printed, redirect_stderr(io.StringIO()) as said:
         try:
             main()
         except SystemExit as end:
-            return end.code or 0, said.getvalue()
-    return 0, said.getvalue()
+            return end.code or 0, printed.getvalue(), said.getvalue()
+    return 0, printed.getvalue(), said.getvalue()
 
 
 if __name__ == "__main__":
     assert not {*EXTRAS} & set(sys.modules)
     sys.meta_path[sys.meta_path.index(PathFinder)] = CoreFinder
-    print(json.dumps([run(command) for command in sys.argv[1:]]))
+    print(json.dumps([run(command)[::2] for command in sys.argv[1:]]))

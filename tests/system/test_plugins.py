@@ -30,7 +30,7 @@ def installed(tmp_path_factory):
 
 
 def run(installed: Path, *arguments: str, cwd: Path) -> subprocess.CompletedProcess:
-    path = os.pathsep.join(map(str, (installed, ROOT)))
+    path = os.pathsep.join(map(str, (installed, ROOT, ROOT / "tests" / "helpers")))
     return subprocess.run([sys.executable, *arguments], cwd=cwd, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True)
 
 
@@ -90,14 +90,19 @@ def test_each_part_is_used_whatever_is_imported_first(first, learns, installed, 
     assert "'broken' is left out (RuntimeError: its maker has left)" in done.stderr
 
 
+COMMANDS = """
+from core_alone import run
+for command in ("doctor", "new frames --layout star:4 --out made.toml", "sensors", "robustness --list"):
+    print("".join(run(command)[1:]), end="\\0")
+"""
+
+
 def test_commands_know_the_parts_and_the_doctor_names_the_broken_one(installed, tmp_path):
-    doctor = run(installed, "-m", "twin", "doctor", cwd=tmp_path).stdout.split("Parts of other packages\n")[1].split("\n\n")[0].splitlines()
-    assert len(doctor) == PARTS and sum("LEFT OUT" in line for line in doctor) == 2
-    assert "  arms: broken of tactip-example 0.1; LEFT OUT: RuntimeError: its maker has left" in doctor
-    unknown = run(installed, "-m", "twin", "new", "frames", "--layout", "star:4", "--out", "made.toml", cwd=tmp_path)
-    assert "example-spiral:91" in unknown.stderr
-    assert "example-tip" in run(installed, "-m", "twin", "sensors", cwd=tmp_path).stdout
-    assert "example-haze" in run(installed, "-m", "twin", "robustness", "--list", cwd=tmp_path).stdout
+    doctor, unknown, sensors, conditions, _ = run(installed, "-c", COMMANDS, cwd=tmp_path).stdout.split("\0")
+    parts = doctor.split("Parts of other packages\n")[1].split("\n\n")[0].splitlines()
+    assert len(parts) == PARTS and sum("LEFT OUT" in line for line in parts) == 2
+    assert "  arms: broken of tactip-example 0.1; LEFT OUT: RuntimeError: its maker has left" in parts
+    assert "example-spiral:91" in unknown and "example-tip" in sensors and "example-haze" in conditions
 
 
 def test_an_arm_without_limits_is_refused(monkeypatch):

@@ -123,7 +123,7 @@ class Options:
             if given is not None:
                 parts = (given,) if isinstance(given, str | PathLike) else tuple(given) if isinstance(given, Iterable) else (given,)
                 if not all(isinstance(part, str | PathLike) for part in parts):
-                    raise OptionError(f"{name}={repr(given)[:80]}: expected names or files, such as {name}={EXAMPLES[name]!r}")
+                    raise OptionError(f"{name}={repr(given)[:80]}: expected names, such as {name}={EXAMPLES[name]!r}")
                 object.__setattr__(self, name, tuple(str(part) for part in parts))
         if self.axes is not None and (not self.axes or len(set(self.axes)) < len(self.axes) or not set(self.axes) <= set(AXES)):
             raise OptionError(f"axes={self.axes!r}: expected some of {', '.join(AXES)}, each once")

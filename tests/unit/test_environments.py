@@ -406,6 +406,13 @@ def test_every_way_of_making_many_gives_the_same_episodes():
     assert all(np.array_equal(told[0], other) for other in told[1:])
 
 
+def test_a_specification_in_place_of_its_name_gives_a_short_error():
+    for option, given, asked in (("sensor", load_sensor("mg400-127"), "a name"), ("objects", (load_object("can"),), "names")):
+        with pytest.raises(OptionError, match=f"{option}=.*expected {asked}") as refused:
+            gymnasium.make("tactip/SurfaceFollow-v0", **{option: given})
+        assert len(str(refused.value)) < 200
+
+
 def test_a_learner_of_stable_baselines_gets_ends_as_it_expects_them():
     env = BaselinesVecEnv(gymnasium.make_vec("tactip/SurfaceFollow-v0", num_envs=2, steps=3, observation="oracle"))
     PPO("MultiInputPolicy", env, n_steps=4, batch_size=4, n_epochs=1, seed=0, device="cpu").learn(8)
@@ -416,8 +423,15 @@ def test_a_learner_of_stable_baselines_gets_ends_as_it_expects_them():
         assert done.all() == (step == 3) and all({"is_success", "off_mm"} <= info.keys() for info in infos)
     assert all(info["TimeLimit.truncated"] for info in infos)
     assert all(not np.array_equal(info["terminal_observation"]["tactile"], seen["tactile"][row]) for row, info in enumerate(infos))
-    with pytest.raises(OptionError, match="is not a vector"):
-        BaselinesVecEnv(gymnasium.make_vec("CartPole-v1", num_envs=2))
+
+
+def test_a_learner_of_stable_baselines_takes_only_a_vector_of_this_program_without_wrappers():
+    vector = gymnasium.make_vec("tactip/SurfaceFollow-v0", num_envs=2, observation="oracle")
+    with pytest.raises(OptionError, match="TransformReward.* would be lost"):
+        BaselinesVecEnv(gymnasium.wrappers.vector.TransformReward(vector, lambda reward: -reward))
+    for other in (gymnasium.make_vec("CartPole-v1", num_envs=2), gymnasium.make("tactip/SurfaceFollow-v0"), [vector]):
+        with pytest.raises(OptionError, match="is not a vector"):
+            BaselinesVecEnv(other)
 
 
 def test_the_same_seed_gives_the_same_episode_on_finite_elements():

@@ -290,6 +290,19 @@ def test_actions_that_are_no_numbers_are_refused_and_move_nothing(task, size):
     assert np.array_equal(env.unwrapped.scene.data.qpos, before)
 
 
+@pytest.mark.parametrize(
+    ("task", "wrong"),
+    [("GraspLift", wrong) for wrong in ({"mass_kg": -1.0}, {"friction": np.nan}, {"friction": "high"}, {"mass": 0.1})]
+    + [("PegInsert", wrong) for wrong in ({"off_mm": 1.0}, {"tilt_deg": np.inf}, {"tilt": 1.0})],
+)
+def test_wrong_options_of_an_episode_are_refused_by_name(task, wrong):
+    env = gymnasium.make(f"tactip/{task}-v0", observation="none").unwrapped
+    with pytest.raises(OptionError, match=r"call reset\(\) first"):
+        env.step(env.action_space.sample())
+    with pytest.raises(OptionError, match=f"reset\\(options=...\\).*{next(iter(wrong))}"):
+        env.reset(seed=0, options=wrong)
+
+
 def test_a_scripted_controller_inserts_pegs_by_what_the_sensors_feel():
     env = gymnasium.make("tactip/PegInsert-v0", observation="none").unwrapped
     for seed in (0, 1):

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from stable_baselines3.common.vec_env import VecEnv
 
 from training.environments.environment import TactileVectorEnv
@@ -20,22 +20,25 @@ class BaselinesVecEnv(VecEnv):
     Parameters
     ----------
     vector : VectorEnv
-        What ``gymnasium.make_vec`` makes of a task's id. Its ``autoreset_mode`` becomes ``SAME_STEP``.
+        What ``gymnasium.make_vec`` makes of a task's id, without wrappers. Its ``autoreset_mode`` becomes ``SAME_STEP``.
 
     Raises
     ------
     OptionError
-        The vector is no ``TactileVectorEnv``.
+        The vector is no ``TactileVectorEnv``, or is wrapped.
     """
 
     def __init__(self, vector: VectorEnv[Any, Any, Any]) -> None:
-        inner = vector.unwrapped
-        if not isinstance(inner, TactileVectorEnv):
-            raise OptionError(f"{inner!r} is not a vector environment of this program; use gymnasium.make_vec('twin:tactip/EdgeFollow-v0')")
-        self.vector = inner
+        if isinstance(vector, VectorWrapper) and isinstance(vector.unwrapped, TactileVectorEnv):
+            raise OptionError(f"{vector!r} would be lost; give vector.unwrapped, and use a VecEnvWrapper of stable-baselines3")
+        if not isinstance(vector, TactileVectorEnv):
+            raise OptionError(
+                f"{vector!r} is not a vector of this program's environments; use gymnasium.make_vec('twin:tactip/EdgeFollow-v0')"
+            )
+        self.vector = vector
         self._actions: FloatArray = np.zeros(0)
         self.vector.metadata["autoreset_mode"] = AutoresetMode.SAME_STEP
-        super().__init__(inner.num_envs, self.seen_space(), inner.single_action_space)
+        super().__init__(vector.num_envs, self.seen_space(), vector.single_action_space)
 
     def seen_space(self) -> spaces.Space[Any]:
         """Space of one row of ``seen``."""

@@ -212,7 +212,7 @@ def _load_estimator(sensor: SensorSpec) -> tuple["PoseEstimator", bool]:
 
     if sensor.name not in shipped_names():
         known = ", ".join(shipped_names())
-        raise OptionError(f"observation 'pose' needs shipped weights; {sensor.name} has none (there are those of {known} have)")
+        raise OptionError(f"observation 'pose' needs shipped weights; {sensor.name} has none (there are those of {known})")
     found = PoseEstimator.load(sensor.name)
     return found, isinstance(found.part, PinModel) and found.part.sees_light
 

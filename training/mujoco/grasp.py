@@ -13,7 +13,6 @@ import numpy as np
 from training.environments.grasp import STEPS, TOUCHING_MM, GraspHand
 from training.mujoco.geoms import MM
 from training.mujoco.task import GripperTask
-from twin.errors import OptionError
 from twin.types import FloatArray
 
 MASS_KG, FRICTION = (0.05, 0.3), (0.3, 0.8)
@@ -42,9 +41,8 @@ class GraspLift(GripperTask):
 
         All ratios of least grips are equally probable; mass and friction are drawn from those that need the drawn grip.
         """
+        self.require_choices(options, 0.0, mass_kg=(), friction=())
         super().reset(seed=seed)
-        if set(options or {}) - {"mass_kg", "friction"}:
-            raise OptionError(f"reset(options=...) takes mass_kg and friction, not {', '.join(options or {})}")
         least_n = float(np.exp(self.np_random.uniform(*np.log(LEAST_N))))
         friction = self.np_random.uniform(*np.clip(np.array(MASS_KG) * 9.81 / (2 * least_n), *FRICTION))
         drawn = {"mass_kg": 2 * friction * least_n / 9.81, "friction": friction} | (options or {})
@@ -63,7 +61,8 @@ class GraspLift(GripperTask):
 
     def step(self, action: FloatArray) -> tuple[dict[str, FloatArray], float, bool, bool, dict[str, Any]]:
         """Move fingers and hand; see gymnasium. The reward of a step is at most 1, and 0 where the episode fails."""
-        self._hand.move(self.as_action(action)[0])
+        closing = self.as_action(action)[0]
+        self._hand.move(closing)
         self.settle(targets=(self._hand.hand_mm / MM, self._hand.fingers_mm / MM))
         seen, grip_n, height = self._look(), self.grip_n(), self.height_mm()
         crushed, dropped = grip_n > CRUSH * self.least_n, self._hand.hand_mm - height > FALLEN_MM

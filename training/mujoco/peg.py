@@ -35,6 +35,7 @@ class PegInsert(GripperTask):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, FloatArray], dict[str, Any]]:
         """Begin an episode; ``options`` can give ``off_mm`` (x, y) and ``tilt_deg``."""
+        self.require_choices(options, off_mm=(2,), tilt_deg=())
         super().reset(seed=seed)
         angle, off = self.np_random.uniform(0.0, 2 * np.pi), OFF_MM * np.sqrt(self.np_random.uniform())
         given = {"off_mm": off * np.array([np.cos(angle), np.sin(angle)]), "tilt_deg": self.np_random.uniform(-TILTED_DEG, TILTED_DEG)}
@@ -55,8 +56,8 @@ class PegInsert(GripperTask):
 
     def step(self, action: FloatArray) -> tuple[dict[str, FloatArray], float, bool, bool, dict[str, Any]]:
         """Move the hand; see gymnasium. The reward of a step is at most 1, and 0 where the episode fails."""
-        self.hand += self.as_action(action) * [*STEP_MM, STEP_DEG]
-        self.hand = np.clip(self.hand, [-15.0, -15.0, -50.0, -12.0], [15.0, 15.0, 20.0, 12.0])
+        moved_to = self.as_action(action) * [*STEP_MM, STEP_DEG] + self.hand
+        self.hand = np.clip(moved_to, [-15.0, -15.0, -50.0, -12.0], [15.0, 15.0, 20.0, 12.0])
         self._drive()
         self.settle()
         self._done += 1

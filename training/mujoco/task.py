@@ -1,5 +1,6 @@
 """What the environments in MuJoCo scenes have in common: two sensors on a gripper, kinds of observation, and pictures."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, ClassVar, Literal, cast, get_args
 
@@ -11,7 +12,7 @@ from gymnasium import spaces
 from scenes import load_sensor
 from training.environments.grasp import PERIOD_S, as_observation, in_spacings, with_change
 from training.mujoco.model import load_scene
-from training.mujoco.scene import TactileScene
+from training.mujoco.scene import TactileReading, TactileScene
 from twin.errors import OptionError
 from twin.types import FloatArray, ImageArray
 
@@ -64,6 +65,7 @@ class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
         self._geom = self._model.geom(self.held).id
         self._object = int(self._model.geom_bodyid[self._geom])
         self._inertia = self._model.body_inertia[self._object] / self._model.body_mass[self._object]
+        self.felt: list[TactileReading] = []
         self.rest_px = [self.scene.read(site).pins_px for site in sensors]
         self._renderer: mujoco.Renderer | None = None
         shapes = {"pins": (2, 2, *self.rest_px[0].shape), "wrench": (2, 2, 6)}
@@ -79,12 +81,28 @@ class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
         Raises
         ------
         OptionError
-            It has another shape, or is not finite.
+            It has another shape, or is not finite, or no episode has begun.
         """
+        if not self.felt:
+            raise OptionError("step() before reset(); call reset() first")
         numbers = np.asarray(action, float)
         if numbers.shape != self.shape[1:] or not np.isfinite(numbers).all():
             raise OptionError(f"an action of {self.shape[1]} finite numbers is expected, got {numbers}")
         return np.clip(numbers, -1.0, 1.0)
+
+    @staticmethod
+    def require_choices(options: dict[str, Any] | None, least: float = -np.inf, **shapes: tuple[int, ...]) -> None:
+        """Refuse what ``reset(options=...)`` has not, or what is not finite numbers of a shape, above a least one."""
+        for name, value in (options or {}).items():
+            if name not in shapes:
+                raise OptionError(f"reset(options=...) has no {name!r}; it takes {', '.join(shapes)}")
+            try:
+                numbers = np.asarray(value, float)
+            except (TypeError, ValueError):
+                numbers = np.array(np.nan)
+            if numbers.shape != shapes[name] or not (np.isfinite(numbers) & (numbers > least)).all():
+                above = f" above {least:g}" if np.isfinite(least) else ""
+                raise OptionError(f"reset(options=...): {name}={value!r}: expected {math.prod(shapes[name])} finite number(s){above}")
 
     def begin(self, fingers_mm: float) -> None:
         """Set the model to its start, with the fingers closed so far."""

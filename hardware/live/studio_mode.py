@@ -394,6 +394,7 @@ class LiveMode(PageMode):
         findings = examine([self._last.frame], self._feed.model.sensor)
         ill = [f"{finding.text} {finding.remedy}".strip() for finding in findings if finding.verdict is not Grade.HEALTHY]
         self._health = ill or [f"All {len(findings)} checks are good."]
+        self._shots.give(self._last)  # a source that has ended gives no other frame
 
     def _toggle_record(self) -> None:
         if self._feed is None:

@@ -35,13 +35,14 @@ CONTROLS = """() => [...document.querySelectorAll(
 CROPPED = """() => [...document.querySelectorAll('.studio *, .mantine-Button-label, .mantine-Text-root, label')]
   .filter(each => each.checkVisibility() && each.clientWidth > 0 && each.scrollWidth > each.clientWidth + 1)
   .map(each => each.textContent)"""
-OUTSIDE = """() => [...document.querySelectorAll('.studio *, button.mantine-Button-root, input:not([type=hidden])')]
+OUTSIDE = """() => [...document.querySelectorAll('.studio *, .uplot, button.mantine-Button-root, input:not([type=hidden])')]
   .filter(each => each.checkVisibility() && (each.getBoundingClientRect().right > innerWidth + 1 || each.getBoundingClientRect().left < -1))
   .map(each => each.textContent || each.tagName)"""
 PLACES = """() => [...document.querySelectorAll('button.mantine-Button-root, input:not([type=hidden]):not([type=file])')]
   .filter(each => each.checkVisibility()).map(each => Math.round(each.getBoundingClientRect().top))"""
 LEGENDS = """() => [...document.querySelectorAll('.uplot')].map(each =>
   each.querySelector('.u-legend').getBoundingClientRect().top - each.querySelector('.u-wrap').getBoundingClientRect().bottom)"""
+HIDDEN = "[...document.querySelectorAll('.numbers')].map(each => Math.max(each.scrollHeight - each.clientHeight, 0)).filter(each => each)"
 DEPTH = "parseFloat(document.querySelector('[data-depth]')?.dataset.depth)"
 
 
@@ -89,13 +90,14 @@ def test_each_mode_shows_all_of_its_controls_and_text(studio, page, mode):
     page.screenshot(path=OUT / f"{page.size}-{mode.split()[-1].lower()}.png")
     assert overlapping(page.evaluate(CONTROLS)) == []
     assert page.evaluate(CROPPED) == []
+    assert page.evaluate(HIDDEN) == [], "numbers can be read without scrolling"
     assert page.evaluate(OUTSIDE) == []
     last.scroll_into_view_if_needed()
     box = last.bounding_box()
     assert box["y"] >= 0 and box["y"] + box["height"] <= SIZES[page.size][1], "it can be reached"
     page.screenshot(path=OUT / f"{page.size}-{mode.split()[-1].lower()}-end.png")
     if mode in ("Recording", "Live", "Your own sensor"):
-        assert page.locator(".absent").is_visible() and not page.locator('img[src^="blob:"] >> visible=true').count()
+        assert page.locator(".absent >> visible=true").is_visible() and not page.locator('img[src^="blob:"] >> visible=true').count()
 
 
 def test_messages_and_stops_move_no_control(studio, page):
@@ -122,9 +124,12 @@ def test_charts_have_their_legends_below_them_and_appear_in_their_mode_alone(stu
     page.wait_for_timeout(1500)
     page.screenshot(path=OUT / f"{page.size}-charts.png")
     assert min(page.evaluate(LEGENDS)) >= 0
+    assert page.evaluate(OUTSIDE) == []
+    assert not page.locator(".absent >> visible=true").count()
     studio.page.choose("Recording")
     page.wait_for_timeout(1500)
     assert not page.locator(".uplot canvas >> visible=true").count()
+    assert "There is no chart" in page.locator(".absent >> visible=true").inner_text()
 
 
 def test_the_pictures_come_before_the_controls_of_a_narrow_window(studio, page):

@@ -4,6 +4,7 @@ import json
 import re
 import threading
 import time
+from html import escape
 from pathlib import Path
 from urllib.request import Request as Asked
 from urllib.request import urlopen
@@ -11,6 +12,7 @@ from urllib.request import urlopen
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from drawn_frames import drawn_frame, smooth_warp
 from studio_client import StudioClient
 from websockets.datastructures import Headers
@@ -330,6 +332,10 @@ def test_live_shows_a_source_and_an_arm_that_is_read_only(studio, client, tmp_pa
     client.set("EMERGENCY STOP", True)
     until(lambda: not robot.armed)
     assert not robot._arm.state().enabled
+    until(lambda: not studio.modes[3]._feed._thread.is_alive())
+    client.set("Check the sensor's health", True)  # of a source that has ended, too
+    until(lambda: studio.modes[3]._health)
+    wait_html(client, escape(studio.modes[3]._health[0]))
     client.set("Disconnect", True)
     client.set("mode", "Twin")
 
@@ -430,12 +436,16 @@ def test_a_name_that_leads_to_this_machine_by_chance_is_refused():
     assert not from_own_page(Request("/", Headers()), ())
 
 
-def test_values_that_no_browser_gives_are_refused_and_put_back(client):
+def test_values_that_no_browser_gives_are_refused_and_put_back(client, tmp_path):
+    holed = trimesh.creation.box((12.0, 12.0, 6.0))
+    holed.update_faces(np.arange(len(holed.faces)) > 2)
+    holed.export(tmp_path / "holed.stl")
     held = {name: client.value(name) for name in ("friction", "object", "frame", "colour pins by")}
     for label, value, reason in (
         ("friction", -1.0, "friction -1: give a number from 0 to"),
         ("friction", float("nan"), "friction nan"),
         ("object", "../../x", "../../x"),
+        ("object", str(tmp_path / "holed.stl"), "not watertight"),
         ("frame", "cooked", "cooked&#x27; is not a value"),
         ("colour pins by", "smell", "smell&#x27; is not a value"),
     ):

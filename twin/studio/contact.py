@@ -222,8 +222,8 @@ class MovingContact:
             self.setup, self._pipeline = setup, Pipeline(setup.sensor, setup.form)
 
     def _take_up(self, setup: ContactSetup) -> None:
-        self.setup = setup
         self._surface, self._field = SmoothSurface(setup.obj), build_field(setup.obj)
+        self.setup = setup
         self._pipeline = Pipeline(setup.sensor, setup.form)
         self.restart()
 

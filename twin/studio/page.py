@@ -38,7 +38,7 @@ LOCAL = ("127.0.0.1", "localhost", "::1")
 """Hosts that only this machine reaches."""
 PORTS_TRIED, MOST_PORT = 100, 65535
 """Number of consecutive ports that are tried, and the largest port."""
-PICTURES_PX, LARGE_PX, CONTROLS_PX = 330, 620, 350
+PICTURES_PX, LARGE_PX, CONTROLS_PX = 330, 620, 390
 """Widths, px, of the panel with the pictures beside the scene and without the scene, and of the panel with the controls."""
 NO_SCENE = "<style>@media (max-width: 36em) { .mantine-Paper-root:has(.studio) { height: 100%; max-height: 100% !important; } }</style>"
 """Style without a scene: in a narrow window the pictures and controls have its place."""
@@ -275,6 +275,9 @@ class StudioPage:
                 gui.add_image(empty, label="", format="jpeg", jpeg_quality=JPEG_QUALITY, visible=False) for _ in range(2)
             )
         self.charts_tab = pictures.add_tab("Charts")
+        with self.charts_tab:  # PAGE hides this beside a chart
+            none = "There is no chart. Forces and estimates of the modes Twin and Live give charts."
+            gui.add_html(numbers_html(paragraph(none, "absent"), kind="charts"))
         self.next_chart = count().__next__
         self._panel = pictures
         pictures.dock_left()

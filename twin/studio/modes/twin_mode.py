@@ -15,6 +15,7 @@ from scenes.base import SpecError
 from twin.errors import TwinError
 from twin.estimate import SensorModel, readable_labels
 from twin.frames.images import write_image
+from twin.objects import build_field
 from twin.pins import nominal_reference
 from twin.report.table import force_interval
 from twin.studio.contact import ContactAnswer, ContactSetup, Light, MovingContact
@@ -151,7 +152,7 @@ class TwinMode(PageMode):
             if model is not None and name == self._state.sensor:
                 self.contact.use(model)
                 self.worker.show_again()
-            self.model_note = "there is no model of this sensor; give one with --model"
+            self.model_note = "there is no model of this sensor; train one, and start the studio with it"
 
         self.worker.do(use)
 
@@ -319,7 +320,8 @@ class TwinMode(PageMode):
     def _touch(self, name: str) -> None:
         try:
             obj = load_object(name)
-        except SpecError:
+            build_field(obj)  # an unusable mesh is refused here; what it computes is kept
+        except (TwinError, SpecError):
             put(self._object, self._state.object, send=True)
             raise
         self._object.options = tuple(sorted({*self._object.options, name}))

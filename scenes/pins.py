@@ -114,6 +114,8 @@ def layout_from(text: str) -> PinsSpec:
     except SpecError:
         raise
     except ValidationError as error:
-        raise SpecError(f"layout {text}: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
+        raise SpecError(
+            f"layout {text}: {error.errors()[0]['msg'].removeprefix('Value error, ').replace('Input should be', 'must be')}"
+        ) from error
     except ValueError as error:
         raise SpecError(f"layout {text}: {error}; give for example {forms.get(name, name)}") from error

@@ -273,7 +273,9 @@ class FreshFrames:
             self._stopped = f"{why}; {error}"
 
     def _error(self, why: str) -> BlindError:
-        return BlindError(f"{self._source.name}: {why}; {self._arm.name} moves only with fresh frames")
+        return BlindError(
+            f"{self._source.name}: {why}; {self._arm.name} moves only with fresh frames; check the camera, and what else this computer does"
+        )
 
 
 def pieces_to(start: np.ndarray, target: np.ndarray, near_mm: float) -> list[np.ndarray]:

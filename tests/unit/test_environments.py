@@ -299,6 +299,12 @@ def test_an_option_that_cannot_be_meant_is_named(given, named):
         Options.from_keywords(given)
 
 
+def test_no_node_of_a_graph_is_at_the_limit_of_the_observation():
+    env = gymnasium.make("tactip/SurfaceFollow-v0", sensor="mg400-331", observation="graph")
+    seen, _ = env.reset(seed=0)
+    assert np.abs(seen["tactile"]).max() < 0.9 * env.observation_space["tactile"].high.max()
+
+
 @pytest.mark.parametrize(("task", "thing"), [("ObjectRoll", "can"), ("EdgeFollow", "plane")])
 def test_an_object_that_the_task_cannot_use_is_refused(task, thing):
     with pytest.raises(OptionError, match=thing):

@@ -1,6 +1,7 @@
 """Sensors in a MuJoCo scene: laws of statics and dynamics, agreement with the finite elements, and what is refused."""
 
 import pickle
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import gymnasium
@@ -12,11 +13,13 @@ from peg_expert import Expert
 
 from hardware.rig.geometry import PlacedObject
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
+from scenes.write import sensor_files
 from training.mujoco import TactileScene
 from training.mujoco.carried import CARRIED, open_world
 from training.mujoco.geoms import FILLET_MM, solid_of
 from training.mujoco.grasp import BONUS, CRUSH, FRICTION, MASS_KG, WANTED
 from training.mujoco.model import attach_sensor, load_scene, sensor_part, write_urdf
+from training.surrogate.model import SurrogateError, mechanics_of, surrogate_of
 from training.surrogate.solids import Drum, Ellipsoid, SweptBox, distances_to
 from twin.errors import ContactError, OptionError
 from twin.geometry.pins import rest_pins
@@ -29,12 +32,12 @@ SENSOR = "mg400-331"
 WEIGHT = 9.81
 
 
-def scene_of(bodies, *, geom="", dt=0.002, **options):
+def scene_of(bodies, *, geom="", dt=0.002, sensor=SENSOR, **options):
     """A scene of the tip at the origin, its apex up, and a body above it."""
     model = mujoco.MjModel.from_xml_string(
         f"<mujoco><option timestep='{dt}'/><worldbody><body name='tip'>{geom}<site name='tip'/></body>{bodies}</worldbody></mujoco>"
     )
-    return TactileScene(model, {"tip": SENSOR}, **options)
+    return TactileScene(model, {"tip": sensor}, **options)
 
 
 def above(shape, height_mm, *, mass=0.1, joint="<joint type='slide' axis='0 0 1'/>"):
@@ -179,6 +182,21 @@ def test_geoms_that_no_skin_can_touch_are_refused_by_name():
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
     with pytest.raises(OptionError, match="RK4"):
         TactileScene(model, {"tip": SENSOR}, touchable=[])
+
+
+def test_a_sensor_of_ones_own_takes_its_own_surrogate(tmp_path):
+    own = load_sensor(SENSOR)
+    own = own.model_copy(update={"name": "own", "skin": own.skin.model_copy(update={"thickness_mm": 1.5 * own.skin.thickness_mm})})
+    for name, text in sensor_files(own, "own").items():
+        (tmp_path / name).write_text(text)
+    own = load_sensor(str(tmp_path / "own.toml"))
+    with pytest.raises(SurrogateError, match="no surrogate of own goes with the package.*surrogates="):
+        scene_of(above(BALL, 39.0), sensor=own)
+    file, made = tmp_path / "own.safetensors", surrogate_of(load_sensor(SENSOR))
+    replace(made, about=made.about | {"mechanics": mechanics_of(own)}).save(file)
+    scene_of(above(BALL, 39.0), sensor=own, surrogates={"own": file}).step()
+    grasp = gymnasium.make("tactip/GraspLift-v0", sensor=str(tmp_path / "own.toml"), surrogate=str(file))
+    assert np.isfinite(grasp.reset(seed=0)[0]["tactile"]).all()
 
 
 def test_a_mesh_of_a_box_is_that_box():

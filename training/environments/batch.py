@@ -11,7 +11,7 @@ from gymnasium import spaces
 
 from scenes import ObjectSpec, RandomisationSpec, SensorSpec, load_experiment, load_object, load_randomisation, load_sensor
 from scenes.files import quote
-from training.environments.observe import IMAGE_PX, KINDS, LARGEST, PICTURES, Eye, Kind, Pictures
+from training.environments.observe import IMAGE_PX, KINDS, PICTURES, Eye, Kind, Pictures
 from training.environments.tasks import TASKS, StepOutcome, WorldState, add_tasks
 from training.environments.world import AXES, Surfaces, Tool, motions
 from training.generation.config import draw_friction, draw_sensor
@@ -239,7 +239,7 @@ class Batch:
         if self.options.observation == "image":
             return spaces.Dict({"tactile": spaces.Box(0, 255, (IMAGE_PX, IMAGE_PX, stack), np.uint8), "goal": goal})
         shape = (len(self.task.oracle_names),) if self.eye is None else self.eye.shape
-        limit = MOST_ORACLE if self.eye is None else LARGEST
+        limit = MOST_ORACLE if self.eye is None else self.eye.limit
         return spaces.Dict({"tactile": spaces.Box(-limit, limit, (stack, *shape), np.float32), "goal": goal})
 
     def begin(self, row: int, rng: np.random.Generator, wanted: Mapping[str, Any] | None = None) -> None:

@@ -126,6 +126,11 @@ class Eye:
             return (len(self._estimator.names) + 1,)
         return (pins, 2) if self.kind == "pins" else (pins, 5)
 
+    @property
+    def limit(self) -> float:
+        """Largest size of an observation. The outermost nodes of a graph are ten spacings from its centre."""
+        return 2 * LARGEST if self.kind == "graph" else LARGEST
+
     def begin(self, row: int, sensor: SensorSpec) -> None:
         """Use the camera and light that were sampled for an environment's episode."""
         self._views[row] = self._nominal if sensor is self.sensor else SensorView(sensor, self.form, self.pictures)
@@ -165,7 +170,7 @@ class Eye:
         graphs = [make_graph("voronoi", pins, outmost=self.reference.outmost, net=self.reference.net) for pins in pins_px]
         if self.kind == "graph":
             seen = np.stack([node_features(graph, self.reference) for graph in graphs])
-            return np.clip(seen, -LARGEST, LARGEST).astype(np.float32)
+            return np.clip(seen, -self.limit, self.limit).astype(np.float32)
         assert self._estimator is not None
         count = len(pins_px)
         table = PinTable(

@@ -10,6 +10,7 @@ contact. Therefore ``step`` uses ``mj_step1`` and ``mj_step2``: after ``mj_step`
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -80,12 +81,14 @@ class TactileScene:
     ----------
     model : mujoco.MjModel
     sensors : mapping of str to str or SensorSpec
-        For each sensor's site: a sensor's name, file or specification. It needs a surrogate.
+        For each sensor's site: a sensor's name, file or specification.
     touchable : sequence of str, optional
         Names of the geoms that the sensors can touch. By default all that collide with others and are not of the sensor's own body.
     data : mujoco.MjData, optional
     loss_s_per_m : float
         Loss of skin and gel, see ``LOSS_S_PER_M``; with 0 a contact without friction is elastic.
+    surrogates : mapping of str to path, optional
+        By a sensor's name the file that ``twin surrogate`` wrote. It is needed for a sensor of which the package has none.
 
     Attributes
     ----------
@@ -108,6 +111,7 @@ class TactileScene:
         touchable: Sequence[str] | None = None,
         data: mujoco.MjData | None = None,
         loss_s_per_m: float = LOSS_S_PER_M,
+        surrogates: Mapping[str, str | Path] | None = None,
     ) -> None:
         if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
             raise OptionError("integrator RK4 computes forces between two steps; choose Euler, implicit or implicitfast")
@@ -131,7 +135,8 @@ class TactileScene:
         self._set = np.array([specs.index(each) for each in self.sensors.values()], int)  # of each sensor: number of its contacts
         self._row = np.array([int((self._set[:place] == number).sum()) for place, number in enumerate(self._set)], int)  # row in them
         counts = np.bincount(self._set, minlength=len(specs)).tolist()
-        self._contacts = [SurrogateContacts(surrogate_of(each), each, count, few=True) for each, count in zip(specs, counts, strict=True)]
+        surrogate = [surrogate_of(each, (surrogates or {}).get(each.name)) for each in specs]
+        self._contacts = [SurrogateContacts(*each, few=True) for each in zip(surrogate, specs, counts, strict=True)]
         self._radius = np.array([self._contacts[number].radius_mm for number in self._set])
         self._views: dict[tuple[str, Form, Pictures], SensorView] = {}
         self.reset()

@@ -32,6 +32,8 @@ class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
         nothing. The second half is ``CHANGES`` times their change since the last decision.
     render_mode : {None, "rgb_array"}
         ``render`` then shows the scene.
+    surrogate : str, optional
+        File that ``twin surrogate`` wrote, for a sensor of which the package has none.
 
     Attributes
     ----------
@@ -52,16 +54,19 @@ class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
     """Numbers of values of the state and of an action."""
     timestep_s: ClassVar[float] = 0.002
 
-    def __init__(self, sensor: str = "mg400-331", observation: Touch = "pins", render_mode: str | None = None) -> None:
+    def __init__(
+        self, sensor: str = "mg400-331", observation: Touch = "pins", render_mode: str | None = None, surrogate: str | None = None
+    ) -> None:
         if observation not in TOUCHES:
             raise OptionError(f"observation={observation!r}: expected one of {', '.join(TOUCHES)}")
         if render_mode not in (None, "rgb_array"):
             raise OptionError(f"render_mode={render_mode!r}: expected None or rgb_array")
         self.observation, self.render_mode = observation, render_mode
-        spec, sensors = load_scene(self.world, load_sensor(sensor))
+        tip = load_sensor(sensor)
+        spec, sensors = load_scene(self.world, tip)
         self._model = spec.compile()
         self._model.opt.timestep = self.timestep_s
-        self.scene = TactileScene(self._model, sensors, touchable=[self.held])
+        self.scene = TactileScene(self._model, sensors, touchable=[self.held], surrogates={tip.name: surrogate} if surrogate else None)
         self._geom = self._model.geom(self.held).id
         self._object = int(self._model.geom_bodyid[self._geom])
         self._inertia = self._model.body_inertia[self._object] / self._model.body_mass[self._object]

@@ -310,7 +310,7 @@ def surrogate_of(sensor: SensorSpec, file: str | Path | None = None) -> Surrogat
             return load_surrogate(path)
     raise SurrogateError(
         f"no surrogate of {sensor.name} goes with the package; make one: twin surrogate --sensor NAME_OR_FILE --out FILE, "
-        "and give it as surrogate=FILE, or use backend='fem'"
+        "and give it as `surrogate` (TactileScene: surrogates={NAME: FILE}) or, outside robot scenes, use backend='fem'"
     )
 
 

@@ -303,7 +303,7 @@ def pack_run(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, 
 def make_surrogate(
     sensor: options.Sensor,
     out: Annotated[Path, typer.Option(metavar="FILE", help="file to write, *.safetensors")],
-    paths: Annotated[int, typer.Option(metavar="N", help="solved paths to train on, about 6 s each on one core")] = 120,
+    paths: Annotated[int, typer.Option(metavar="N", min=10, help="solved paths to train on, about 6 s each on one core")] = 120,
     seed: Annotated[int, typer.Option(min=0, help="seed of the sampled paths")] = 0,
     workers: options.Workers = options.CORES,
     *,

@@ -97,8 +97,6 @@ def test_answers_come_in_order_and_each_shows_its_own_pose(client):
 def test_an_impossible_place_stops_the_object_and_says_why(client):
     since = len(client.updates)
     client.set("object", "plane")
-    client.wait(lambda u: u.number > 0, WAIT_S, since=since)
-    since = len(client.updates)
     client.set("depth, mm", 19.5)
     update = client.wait(lambda u: "half the gel" in u.html or "stays here" in u.html, 3 * WAIT_S, since=since)
     assert update.depth_mm < 19.5
@@ -215,6 +213,36 @@ def test_an_object_that_is_chosen_while_a_sensor_opens_is_kept(studio, client):
     assert studio.twin.contact.setup.obj.name == client.value("object") == "cylinder"
     since = len(client.updates)
     studio.twin.open(StudioState(sensor=SENSOR, object="sphere", pose={"depth_mm": 1.0}))
+    client.wait(lambda u: "of 127" in u.html, WAIT_S, since=since)
+
+
+def test_a_depth_that_is_chosen_while_an_object_is_taken_or_a_sensor_opens_is_kept(studio, client, monkeypatch):
+    drag(client, 2.0)
+    twin, taken, prepare = studio.twin, studio.twin.contact.change, studio.twin._prepare
+
+    def take(**given):
+        taken(**given)
+        client.set("depth, mm", 0.6)
+        until(lambda: twin._wish.depth_mm == 0.6)
+
+    monkeypatch.setattr(twin.contact, "change", take)
+    since = len(client.updates)
+    client.set("object", "plane")
+    client.wait(lambda u: abs(u.depth_mm - 0.6) < 1e-4, WAIT_S, since=since)
+    monkeypatch.undo()
+
+    def prepared(state):
+        client.set("depth, mm", 1.2)
+        until(lambda: twin._wish.depth_mm == 1.2)
+        return prepare(state)
+
+    monkeypatch.setattr(twin, "_prepare", prepared)
+    since = len(client.updates)
+    client.set("sensor", "mg400-331")
+    client.wait(lambda u: "of 331" in u.html and abs(u.depth_mm - 1.2) < 0.1, WAIT_S, since=since)
+    monkeypatch.undo()
+    since = len(client.updates)
+    twin.open(StudioState(sensor=SENSOR, object="sphere", pose={"depth_mm": 1.0}))
     client.wait(lambda u: "of 127" in u.html, WAIT_S, since=since)
 
 

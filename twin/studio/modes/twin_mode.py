@@ -334,7 +334,9 @@ class TwinMode(PageMode):
             with self._showing:
                 self._scene.put_object(obj)
             put(self._friction, self._own_friction())
-            self.ask(_as_deep(wish, before, self.contact), gesture=False)
+            deep = _as_deep(wish, before, self.contact)
+            if self._wish is wish:  # otherwise the user has just wished another pose
+                self.ask(deep, gesture=False)
 
         self.worker.do(change)
 
@@ -369,7 +371,7 @@ class TwinMode(PageMode):
                 self._tracer.__exit__(None, None, None)
             self._page.gui.set_panel_label(heading(state))
             before, friction = self._choices(), self._own_friction()
-            self._state, wish = state, state.object_pose()
+            self._state, wish = state, self._wish if as_deep else state.object_pose()
             self._wish = _as_deep(wish, self.contact.touch_mm(wish), prepared[0]) if as_deep else wish
             self._shown, self._drawn = PinColour(state.colour), OverlayChoices(state.drawn)
             self.model_note = MODEL_LOADING

@@ -205,6 +205,7 @@ class CameraFeed:
         self.robot = WatchedArm(arm, self._source, model.pipeline) if arm else None
         self.name = self._source.name + (f" and {self.robot.name}" if self.robot else "")
         self._session = LiveSession(self._source, model)
+        self.ended = ""  # why no more frames come
         self._writer: SessionWriter | None = None
         self._writing = threading.Lock()
         self._end = threading.Event()
@@ -236,10 +237,12 @@ class CameraFeed:
             try:
                 self._session.on_estimate = deliver
                 self._session.run(going=lambda: not self._end.is_set())
-                if not self._end.is_set():
-                    on_end(f"{self.name}: has ended")
+                if self._end.is_set():
+                    return
+                self.ended = f"{self.name}: has ended"
             except Exception as error:  # any error must be reported, because otherwise the picture would just stand still
-                on_end(str(error) if isinstance(error, TwinError) else f"{self.name}: ended by a fault of this program ({error!r})")
+                self.ended = str(error) if isinstance(error, TwinError) else f"{self.name}: ended by a fault of this program ({error!r})"
+            on_end(self.ended)
 
         self._thread = threading.Thread(target=run, name="studio-camera", daemon=True)
         self._thread.start()
@@ -362,7 +365,7 @@ class LiveMode(PageMode):
             feed = CameraFeed(self._camera.value.strip(), self._arm.value.strip(), contact.setup.sensor, contact.model, lacking)
             self._pipeline = Pipeline(feed.model.sensor, feed.model.form, feed.model.pipeline.reference)
             self._feed = feed
-            feed.start(self._shots.give, self.complain)
+            feed.start(self._shots.give, self._report_end)
             arm = "" if feed.robot is None else f"{feed.robot.name}: {feed.robot.limits()}"
             self._limits.content = numbers_html(paragraph(arm, "note"))
 
@@ -379,6 +382,11 @@ class LiveMode(PageMode):
                 self._nudges.visible = False
                 if feed is not None:
                     feed.stop()
+
+    def _report_end(self, why: str) -> None:
+        self.complain(why)
+        if self._last is not None:
+            self._shots.give(self._last)
 
     def emergency_stop(self) -> None:
         """Stop the arm. This is never refused."""
@@ -435,8 +443,8 @@ class LiveMode(PageMode):
         pictures = frame_pictures(feed.model.sensor, pipeline.reference, shot.frame, seen)
         robot = feed.robot
         numbers = [
-            badge("live", "moving") + (badge("recording", "moving") if self._record.value else ""),
-            paragraph(feed.name, "note"),
+            badge("ended" if feed.ended else "live", "moving") + (badge("recording", "moving") if self._record.value else ""),
+            paragraph(feed.ended, "stop") or paragraph(feed.name, "note"),
             *frame_numbers(shot, seen),
             "" if robot is None else badge("ARMED" if robot.armed else "arm: read only", "moving" if robot.armed else ""),
             "" if robot is None else paragraph(robot.words(), "note"),

@@ -361,6 +361,7 @@ def test_live_shows_a_source_and_an_arm_that_is_read_only(studio, client, tmp_pa
     until(lambda: not robot.armed)
     assert not robot._arm.state().enabled
     until(lambda: not studio.modes[3]._feed._thread.is_alive())
+    wait_html(client, "has ended</p>")
     client.set("Check the sensor's health", True)  # of a source that has ended, too
     until(lambda: studio.modes[3]._health)
     wait_html(client, escape(studio.modes[3]._health[0]))

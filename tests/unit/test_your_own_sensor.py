@@ -301,7 +301,7 @@ def test_a_pin_that_the_nearest_layouts_have_too_many_is_named_by_its_place_and_
     (step,) = [line for line in found.next_steps if "pins.csv" in line]
     offered, copy = re.search(r"copy (\S+) to (\S+),", step).groups()
     Path(copy).write_text(Path(offered).read_text())
-    assert f"--layout positions:{copy}" in step
+    assert f"`layout` positions:{copy}" in step
     again = new_sensor(folder, tmp_path / "mine.toml", layout=layout_from(f"positions:{copy}"))
     assert again.identified.sure and again.health.all_pins == 1.0, again.lines()
 

@@ -527,8 +527,8 @@ def _describe_result(
         copy = out.with_name(f"{out.stem}-{FOUND_PINS}")
         steps.append(
             f"decide whether the pins are {layouts}: look at the places above in the overlay. If not, copy "
-            f"{sibling_folder(out, 'new') / FOUND_PINS} to {copy}, remove pins that do not exist, add those that lack, and give the file: "
-            f"twin new {recording.path} --layout positions:{copy} --out {out}"
+            f"{sibling_folder(out, 'new') / FOUND_PINS} to {copy}, remove pins that do not exist, add those that lack, and run this "
+            f"again with `layout` positions:{copy}"
         )
     if rest.source != "given":
         steps.append("record a frame without contact and run this again with `no_contact` FRAME")

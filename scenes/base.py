@@ -15,6 +15,11 @@ class SpecError(ValueError):
     """
 
 
+def problem_text(found: Mapping[str, Any]) -> str:
+    """What is wrong, of one of pydantic's errors, in our words."""
+    return str(found["msg"]).removeprefix("Value error, ").replace("Input should be", "must be")
+
+
 # Largest number of characters of a name. File systems allow 255 bytes, a character has up to 4 bytes in UTF-8, and names get prefixes and
 # suffixes.
 LONGEST_NAME = 100

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from scenes.base import Name, Section
+from scenes.base import Name, Section, problem_text
 
 LABELS = tuple(f"{kind}_{axis}" for kind in ("pose", "move") for axis in range(1, 7))
 AXES = {"x": 0, "y": 1, "z": 2}
@@ -177,5 +177,5 @@ class ExperimentSpec(Section):
         try:
             self.widen()
         except ValidationError as error:
-            raise ValueError(f"wide: {error.errors()[0]['msg'].removeprefix('Value error, ')}") from error
+            raise ValueError(f"wide: {problem_text(error.errors()[0])}") from error
         return self

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from scenes.base import Section, SpecError
+from scenes.base import Section, SpecError, problem_text
 from scenes.experiment import ExperimentSpec
 from scenes.files import LONGEST_PATH, LONGEST_SHOWN, quote, read_toml
 from scenes.object import MeshShape, ObjectSpec
@@ -223,7 +223,7 @@ def explain_problems(error: ValidationError, model: type[BaseModel]) -> str:
             problems.append(f"key '{key}' is missing; add it (see the shipped specifications for examples)")
         else:
             came = "" if isinstance(item["input"], dict) else f", got {quote(repr(item['input']))}"
-            said = quote(item["msg"].removeprefix("Value error, ").replace("Input should be", "must be"), 4 * LONGEST_SHOWN)
+            said = quote(problem_text(item), 4 * LONGEST_SHOWN)
             between = "" if not key else " " if said.startswith("must be") else ": "
             problems.append(f"{key}{between}{said}{came}")
     if len(found) > MOST_PROBLEMS:

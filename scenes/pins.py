@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from scenes.base import OpenSection, Positive, SpecError
+from scenes.base import OpenSection, Positive, SpecError, problem_text
 from scenes.layouts import MOST_PINS
 from scenes.plugins import classes
 
@@ -114,8 +114,6 @@ def layout_from(text: str) -> PinsSpec:
     except SpecError:
         raise
     except ValidationError as error:
-        raise SpecError(
-            f"layout {text}: {error.errors()[0]['msg'].removeprefix('Value error, ').replace('Input should be', 'must be')}"
-        ) from error
+        raise SpecError(f"layout {text}: {problem_text(error.errors()[0])}") from error
     except ValueError as error:
         raise SpecError(f"layout {text}: {error}; give for example {forms.get(name, name)}") from error

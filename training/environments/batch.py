@@ -117,13 +117,13 @@ class Options:
             if isinstance(given, PathLike):
                 object.__setattr__(self, name, str(given))
             elif not (isinstance(given, str) or (given is None and name != "sensor")):
-                raise OptionError(f"{name}={repr(given)[:80]}: expected a name or a file")
+                raise OptionError(f"{name}={quote(repr(given))}: expected a name or a file")
         for name in ("axes", "objects"):
             given = getattr(self, name)
             if given is not None:
                 parts = (given,) if isinstance(given, str | PathLike) else tuple(given) if isinstance(given, Iterable) else (given,)
                 if not all(isinstance(part, str | PathLike) for part in parts):
-                    raise OptionError(f"{name}={repr(given)[:80]}: expected names, such as {name}={EXAMPLES[name]!r}")
+                    raise OptionError(f"{name}={quote(repr(given))}: expected names, such as {name}={EXAMPLES[name]!r}")
                 object.__setattr__(self, name, tuple(str(part) for part in parts))
         if self.axes is not None and (not self.axes or len(set(self.axes)) < len(self.axes) or not set(self.axes) <= set(AXES)):
             raise OptionError(f"axes={self.axes!r}: expected some of {', '.join(AXES)}, each once")

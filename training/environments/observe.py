@@ -166,7 +166,7 @@ class Eye:
     def _of_pins(self, pins_px: FloatArray, light: FloatArray | None = None) -> FloatArray:
         """Observations (R, ...) from pins (R, N, 2), relative to the nominal layout, and from the light (R, N) on their caps."""
         if self.kind == "pins":
-            return np.clip((pins_px - self.reference.pins_px) / self._spacing, -LARGEST, LARGEST).astype(np.float32)
+            return np.clip((pins_px - self.reference.pins_px) / self._spacing, -self.limit, self.limit).astype(np.float32)
         graphs = [make_graph("voronoi", pins, outmost=self.reference.outmost, net=self.reference.net) for pins in pins_px]
         if self.kind == "graph":
             seen = np.stack([node_features(graph, self.reference) for graph in graphs])
@@ -206,7 +206,7 @@ class Eye:
         assert self._estimator is not None
         scale = np.array([POSE_SCALES[unit] for unit in self._estimator.units])
         known = np.nan_to_num(np.asarray(executed, float).reshape(len(value), 1), nan=1.0)
-        return np.clip(np.concatenate([value / scale, known], axis=1), -LARGEST, LARGEST).astype(np.float32)
+        return np.clip(np.concatenate([value / scale, known], axis=1), -self.limit, self.limit).astype(np.float32)
 
 
 def _load_estimator(sensor: SensorSpec) -> tuple["PoseEstimator", bool]:

@@ -371,8 +371,8 @@ class TwinMode(PageMode):
                 self._tracer.__exit__(None, None, None)
             self._page.gui.set_panel_label(heading(state))
             before, friction = self._choices(), self._own_friction()
-            self._state, wish = state, self._wish if as_deep else state.object_pose()
-            self._wish = _as_deep(wish, self.contact.touch_mm(wish), prepared[0]) if as_deep else wish
+            self._state, wish = state, self._wish
+            self._wish = _as_deep(wish, self.contact.touch_mm(wish), prepared[0]) if as_deep else state.object_pose()
             self._shown, self._drawn = PinColour(state.colour), OverlayChoices(state.drawn)
             self.model_note = MODEL_LOADING
             self._take_up(*prepared)

@@ -1,6 +1,7 @@
 """What Sphinx does for this documentation beyond its extensions: generated pages, notebooks beside tutorials, formulas as MathML."""
 
 import os
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -56,19 +57,22 @@ def _name_notebook(app: Sphinx, name: str, source: list[str]) -> None:
         source[0] = f"{title}\n\n<p><a class='notebook' href='{stem}.ipynb' download>This page as a notebook</a></p>\n{rest}"
 
 
+@cache
+def _titles(toc: nodes.bullet_list) -> nodes.bullet_list:
+    """A page's table of contents without the headings below its title. A page that lists other pages keeps all."""
+    if next(toc.findall(addnodes.toctree), None) is not None:
+        return toc
+    short = nodes.bullet_list()
+    short += [nodes.list_item("", item[0].deepcopy()) for item in toc]
+    return short
+
+
 def _draw_titles_only(app: Sphinx, name: str, template: str, context: dict[str, Any], page: nodes.document | None) -> None:
     """The navigation shows titles alone. For each page, Sphinx would copy all headings of all pages and drop them: half of its time."""
     env, draw = app.env, context["toctree"]
 
-    def titles(toc: nodes.bullet_list) -> nodes.bullet_list:
-        if next(toc.findall(addnodes.toctree), None) is not None:
-            return toc
-        short = nodes.bullet_list()
-        short += [nodes.list_item("", item[0].deepcopy()) for item in toc]
-        return short
-
     def draw_titles(**options: Any) -> str:
-        whole, env.tocs = env.tocs, {page: titles(toc) for page, toc in env.tocs.items()}
+        whole, env.tocs = env.tocs, {page: _titles(toc) for page, toc in env.tocs.items()}
         try:
             return draw(**options)
         finally:

@@ -5,16 +5,17 @@ import signal
 import socket
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from arms import mg400_of
 
 from hardware.arms.open_arm import open_arm
-from hardware.arms.ur.driver import IDLE, PLAYING
+from hardware.arms.ur.driver import IDLE, PLAYING, UR
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.emulators.ur import UrEmulator
-from hardware.errors import DeviceError
+from hardware.errors import DeviceError, StaleDataError
 
 AWAY = np.array([100.0, -500, 200, 0, 0, -160])
 SOON_S = 0.1
@@ -174,6 +175,13 @@ def test_a_program_is_ended_over_the_dashboard_if_the_client_has_died(emulator):
         raise DeviceError("it is lost")
 
     assert "Press its emergency stop" not in failure(emulator, lose_the_client)
+
+
+def test_an_arm_of_which_nothing_has_come_so_far_is_stale():
+    arm = UR("127.0.0.1")
+    arm._client = SimpleNamespace(is_alive=True, feedback={})
+    with pytest.raises(StaleDataError, match="no feedback has come so far"):
+        arm.state()
 
 
 def test_an_mg400_whose_enabling_fails_is_disabled(monkeypatch):

@@ -245,10 +245,11 @@ class UR(BaseArm):
         while True:
             self._require_connected()
             packet, now_s = self._client.feedback, time.monotonic()
-            if (age_s := now_s - packet["time_s"]) <= max_age_s:
+            if packet and (age_s := now_s - packet["time_s"]) <= max_age_s:
                 return dict(packet)
             if now_s - asked_s > READ_S:
-                raise StaleDataError(f"{self.name}: newest feedback is {age_s:.2f} s old (allowed {max_age_s:g} s); connect() again")
+                heard = f"newest feedback is {age_s:.2f} s old (allowed {max_age_s:g} s)" if packet else "no feedback has come so far"
+                raise StaleDataError(f"{self.name}: {heard}; connect() again")
             time.sleep(POLL_S)
 
     def _shows(self, obeyed: Callable[[dict[str, Any]], bool], within_s: float) -> bool:

@@ -107,7 +107,7 @@ class Recording:
         self.failed.clear()
         for index, frame in self._read_chosen(chosen):
             if isinstance(frame, str):
-                self.failed.append({"image_name": self.names[index], "reason": frame.removeprefix(f"{self.names[index]}: ")})
+                self.failed.append({"image_name": self.names[index], "reason": frame})
             else:
                 yield frame
 
@@ -119,13 +119,11 @@ class Recording:
         FrameError
             The frame can't be read, or its size differs from the recording's.
         """
-        if not self._files:
-            for _, frame in self._read_chosen({index}):
-                if isinstance(frame, str):
-                    raise FrameError(f"{self.names[index]}: {frame}")
-                return frame
-            raise FrameError(f"{self.path.name}: has no frame {index}; it ends after {len(self)}")
-        return self._frame(self._image(self._files[index]), index)
+        for _, frame in self._read_chosen({index}):
+            if isinstance(frame, str):
+                raise FrameError(f"{self.names[index]}: {frame}")
+            return frame
+        raise FrameError(f"{self.path.name}: has no frame {index}; it ends after {len(self)}")
 
     def notes(self) -> list[str]:
         """Irregularities of the recording, and the frames that could not be read so far, one line each."""
@@ -149,20 +147,19 @@ class Recording:
             self.problems.append(f"{file.name}: {note} (the first such frame)")
         return image
 
-    def _frame(self, image: np.ndarray, index: int, time_s: float = 0.0) -> Frame:
-        name = self.names[index]
-        if image.shape[1::-1] != tuple(self.size_px):
-            expected, got = times(self.size_px), times(image.shape[1::-1])
-            raise FrameError(f"{name}: expected {expected} as the recording's other frames, got {got}; leave it out or record it again")
-        return Frame(image, self.form, name, time_s, index)
-
     def _read_chosen(self, chosen: Collection[int]) -> Iterator[tuple[int, Frame | str]]:
         """Index and frame, or the reason why it can't be read, of chosen frames of any source."""
+        expected = tuple(self.size_px)
         for index, image, time_s in self._images(chosen):
-            try:
-                yield index, image if isinstance(image, str) else self._frame(image, index, time_s)
-            except FrameError as error:
-                yield index, str(error)
+            if isinstance(image, str):
+                yield index, image.removeprefix(f"{self.names[index]}: ")
+            elif (got := image.shape[1::-1]) != expected:
+                yield (
+                    index,
+                    f"expected {times(expected)} as the recording's other frames, got {times(got)}; leave it out or record it again",
+                )
+            else:
+                yield index, Frame(image, self.form, self.names[index], time_s, index)
 
     def _images(self, chosen: Collection[int]) -> Iterator[tuple[int, np.ndarray | str, float]]:
         """Index, picture, or the reason why it can't be read, and time (s) of chosen frames, in order."""

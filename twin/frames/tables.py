@@ -21,13 +21,12 @@ NAME_COLUMNS = ("image_name", "sensor_image", "file_name")
 # Names of label columns in other conventions, in lower case, by those used here: poses in mm and deg, and moves before the frame was taken.
 # tactile_data has pose_x and shear_x, LeRobot the names of a state vector.
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
+_POSES, _MOVES = ("pose_{}", "observation.state.{}", "observation.state.{}.pos", "{}"), ("shear_{}", "observation.tactile.move.{}")
 CALLED_HERE = {
-    **{f"pose_{axis}": f"pose_{k}" for k, axis in enumerate(_AXES, 1)},
-    **{f"shear_{axis}": f"move_{k}" for k, axis in enumerate(_AXES, 1)},
-    **{f"observation.state.{axis}": f"pose_{k}" for k, axis in enumerate(_AXES, 1)},
-    **{f"observation.tactile.move.{axis}": f"move_{k}" for k, axis in enumerate(_AXES, 1)},
-    **{f"observation.state.{axis}.pos": f"pose_{k}" for k, axis in enumerate(_AXES, 1)},
-    **{axis: f"pose_{k}" for k, axis in enumerate(_AXES, 1)},
+    written.format(axis): f"{here}_{k}"
+    for here, names in (("pose", _POSES), ("move", _MOVES))
+    for written in names
+    for k, axis in enumerate(_AXES, 1)
 }
 # Ranges of poses and moves in mm, between which a sensor's contacts lie: below the first they are probably in m (contacts within 100 mm),
 # above the second, which no arm here reaches, in um.
@@ -100,16 +99,15 @@ def _cells(text: str) -> list[list[str]]:
 
 def _distinct(header: list[str]) -> list[str]:
     """Column names. A repeated name gets _2, _3, ... appended."""
-    distinct: list[str] = []
-    taken: set[str] = set()
-    tries: dict[str, int] = {}
+    taken: dict[str, int] = {}  # each name so far, and the number of its last try
+    distinct = []
     for name in header:
         new = name
         while new and new in taken:
-            tries[name] = tries.get(name, 1) + 1
-            new = f"{name}_{tries[name]}"
+            taken[name] += 1
+            new = f"{name}_{taken[name]}"
+        taken[new] = 1
         distinct.append(new)
-        taken.add(new)
     return distinct
 
 

@@ -36,32 +36,26 @@ FULL_CHANGE = 0.3
 """Relative change of a cell's area at both ends of the colour scale."""
 AREA_STOPS = ((5, 48, 97), (67, 147, 195), (247, 247, 247), (214, 96, 77), (103, 0, 31))
 """RGB colours of areas from smaller to larger, evenly spaced: those of matplotlib's RdBu_r, which the charts of reports have."""
-NO_REFERENCE = (
-    "no frame without contact was used: the pins at rest are those of the specification, which makes errors of a pose up to four times "
-    "larger; record one frame without contact (init_0.png beside the frames, or `no_contact` FRAME)"
-)
-"""Note for a recording without a usable no-contact frame."""
-NO_OWN_REFERENCE = (
-    "no frame without contact was used: the pins at rest are those that were measured before on this unit; if the camera or the tip was "
-    "touched since, record one frame without contact (init_0.png beside the frames, or `no_contact` FRAME)"
-)
-"""Note for a specification that holds the pins' measured places at rest."""
-MADE_FROM_CONTACTS = (
-    "no frame without contact was used, and none when the specification was made: the pins' rest places were made from contacts; expect "
-    "errors of a tenth of a spacing or so; record one frame without contact (init_0.png beside the frames, or `no_contact` FRAME)"
-)
-"""Note for a specification whose places at rest were estimated from contacts."""
-MEASURED_BEFORE = "measured before"
-"""Text instead of a no-contact frame's name if the reference is the specification's measured places at rest."""
-MADE_OF_CONTACTS = "made from contacts"
-"""Text instead of a no-contact frame's name if the reference is the specification's places at rest that were estimated from contacts."""
+UNMEASURED = "specification"
+"""Text instead of the name of a no-contact frame if the reference is the specification's layout."""
+WITHOUT_NO_CONTACT = {
+    "": (UNMEASURED, ": the pins at rest are those of the specification, which makes errors of a pose up to four times larger;"),
+    "measured": (
+        "measured before",
+        ": the pins at rest are those that were measured before on this unit; if the camera or the tip was touched since,",
+    ),
+    "contacts": (
+        "made from contacts",
+        ", and none when the specification was made: the pins' rest places were made from contacts; expect errors of a tenth of a spacing "
+        "or so;",
+    ),
+}
+"""Text instead of a no-contact frame's name, and the middle of the note, by the origin of the places at rest ("" for none)."""
 FARTHEST_PX = 1e4
 """Largest distance of a drawn point from the frame's origin, px. OpenCV's integers would overflow beyond it."""
 HALF, BRIGHTEST, DARKEST = 127.0, 98.0, 12.0
 """Brightness of a picture: the gray level ``HALF`` that is given to the frame's level at the percentile ``BRIGHTEST``, between the pins if
 some are found. That level counts as ``DARKEST`` at least. The frame is shown at half brightness, so that the drawing on it is visible."""
-UNMEASURED = "specification"
-"""Text instead of the name of a no-contact frame if the reference is the specification's layout."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -207,12 +201,10 @@ def recording_reference(spec: SensorSpec, recording: Recording, problems: list[s
             )
         return found, recording.reference.name
     blob = blob_spec(spec.pipeline, recording.form)
-    if blob.rest_px:
-        made = blob.rest_origin == "contacts"
-        problems.append(MADE_FROM_CONTACTS if made else NO_OWN_REFERENCE)
-        return nominal_reference(spec, recording.form), MADE_OF_CONTACTS if made else MEASURED_BEFORE
-    problems.append(NO_REFERENCE)
-    return nominal_reference(spec, recording.form), UNMEASURED
+    name, why = WITHOUT_NO_CONTACT[blob.rest_origin if blob.rest_px else ""]
+    record = "record one frame without contact (init_0.png beside the frames, or `no_contact` FRAME)"
+    problems.append(f"no frame without contact was used{why} {record}")
+    return nominal_reference(spec, recording.form), name
 
 
 def draw_overlay(frame: Frame, observation: Observation, *, scale: int = 2, numbers: bool = False) -> np.ndarray:
@@ -287,9 +279,7 @@ def overlay_name(frame_name: str, taken: set[str]) -> str:
 
 def _timing(observations: list[Observation]) -> dict[str, dict[str, float]]:
     """Median, 95th and 99th percentile of the milliseconds of each stage."""
-    if not observations:
-        return {}
-    stages = {stage: [o.ms[stage] for o in observations] for stage in observations[0].ms}
+    stages = {stage: [o.ms[stage] for o in observations] for stage in (observations[0].ms if observations else ())}
     return {s: dict(zip(("p50", "p95", "p99"), np.percentile(ms, (50, 95, 99)).round(4).tolist(), strict=True)) for s, ms in stages.items()}
 
 

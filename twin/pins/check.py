@@ -352,12 +352,13 @@ def _light(frames: list[Frame], seen: list[Observation], expected: UsualCapsSpec
 
 def usual_caps(caps: list[Caps]) -> UsualCapsSpec | None:
     """Light and focus of the caps in some frames, medians over the frames; None if no cap can be measured."""
-    measured = [c for c in caps if np.isfinite(c.contrast).any() and np.isfinite(c.edge_px).any()]
-    contrast = float(np.median([np.nanmedian(c.contrast) for c in measured])) if measured else 0.0
-    edge_px = float(np.median([np.nanmedian(c.edge_px) for c in measured])) if measured else 0.0
-    if contrast <= 0 or edge_px <= 0:
-        return None
-    return UsualCapsSpec(contrast=contrast, edge_px=edge_px, unevenness=max(float(np.median([_unevenness(c) for c in measured])), 0.0))
+    measured = [
+        (np.nanmedian(c.contrast), np.nanmedian(c.edge_px), _unevenness(c))
+        for c in caps
+        if np.isfinite([c.contrast, c.edge_px]).any(axis=1).all()
+    ]
+    contrast, edge_px, unevenness = np.median(measured, axis=0).tolist() if measured else (0.0, 0.0, 0.0)
+    return UsualCapsSpec(contrast=contrast, edge_px=edge_px, unevenness=max(unevenness, 0.0)) if min(contrast, edge_px) > 0 else None
 
 
 @lru_cache(maxsize=2)

@@ -77,8 +77,8 @@ def net_of(triangles: np.ndarray, n: int) -> Net | None:
 
 
 @compiled()
-def _area(px: np.ndarray, a: int, b: int, c: int) -> float:
-    """Twice the signed area of a triangle."""
+def double_area(px: np.ndarray, a: int, b: int, c: int) -> float:
+    """Twice the signed area of a triangle of three of the points (N, 2)."""
     return (px[b, 0] - px[a, 0]) * (px[c, 1] - px[a, 1]) - (px[b, 1] - px[a, 1]) * (px[c, 0] - px[a, 0])
 
 
@@ -90,7 +90,7 @@ def _inside(px: np.ndarray, p: int, q: int, r: int, s: int) -> float:
         return -1.0
     ax, ay = px[p, 0] - px[s, 0], px[p, 1] - px[s, 1]
     if q == n or r == n:  # the circle is a straight line
-        area = _area(px, p, s, r) if q == n else _area(px, p, q, s)
+        area = double_area(px, p, s, r) if q == n else double_area(px, p, q, s)
         return area / (ax * ax + ay * ay)
     bx, by, cx, cy = px[q, 0] - px[s, 0], px[q, 1] - px[s, 1], px[r, 0] - px[s, 0], px[r, 1] - px[s, 1]
     a2, b2, c2 = ax * ax + ay * ay, bx * bx + by * by, cx * cx + cy * cy
@@ -103,7 +103,7 @@ def _flip(px: np.ndarray, triangles: np.ndarray, beyond: np.ndarray) -> tuple[np
     n = len(px)
     triangles, beyond = triangles.copy(), beyond.copy()
     for a, b, c in triangles:
-        if max(a, b, c) < n and _area(px, a, b, c) <= 0:
+        if max(a, b, c) < n and double_area(px, a, b, c) <= 0:
             return triangles, beyond, -1
     doubtful = [(t, k) for t in range(len(triangles)) for k in range(3) if t < beyond[t, k]]
     flips = 0
@@ -129,7 +129,5 @@ def _flip(px: np.ndarray, triangles: np.ndarray, beyond: np.ndarray) -> tuple[np
                 if beyond[one, k] == other:
                     beyond[one, k] = new
                     break
-        for k in range(3):
-            doubtful.append((t, k))
-            doubtful.append((u, k))
+        doubtful += [(number, k) for k in range(3) for number in (t, u)]
     return triangles, beyond, flips

@@ -1,6 +1,6 @@
 """Graphs over the pins (nearest neighbours, Delaunay, Voronoi), and the features of their nodes."""
 
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -49,16 +49,14 @@ def make_graph(kind: GraphKind, nodes_px: np.ndarray, *, outmost: np.ndarray | N
     ValueError
         There is no such kind.
     """
-    none = np.full(len(nodes_px), np.nan)
-    if kind == "knn":
-        return PinGraph(kind, nodes_px, knn_edges(nodes_px), none)
-    edges = _delaunay_edges(nodes_px, net)
-    if kind == "voronoi":
-        tessellation = voronoi(nodes_px, outmost=outmost, edges=edges)
-        return PinGraph(kind, nodes_px, knn_edges(nodes_px) if edges is None else edges, tessellation.area_px2, tessellation.cells)
-    if kind == "delaunay":
-        return PinGraph(kind, nodes_px, knn_edges(nodes_px) if edges is None else edges, none)
-    raise ValueError(f"kind must be knn, delaunay or voronoi, not {kind!r}")
+    if kind not in get_args(GraphKind):
+        raise ValueError(f"kind must be knn, delaunay or voronoi, not {kind!r}")
+    triangulated = None if kind == "knn" else _delaunay_edges(nodes_px, net)
+    edges = knn_edges(nodes_px) if triangulated is None else triangulated
+    if kind != "voronoi":
+        return PinGraph(kind, nodes_px, edges, np.full(len(nodes_px), np.nan))
+    tessellation = voronoi(nodes_px, outmost=outmost, edges=triangulated)
+    return PinGraph(kind, nodes_px, edges, tessellation.area_px2, tessellation.cells)
 
 
 def node_features(graph: PinGraph, reference: Reference, kind: Literal["relative", "pixels"] = "relative") -> np.ndarray:

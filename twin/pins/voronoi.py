@@ -180,15 +180,11 @@ def _cells(nodes: np.ndarray, start: np.ndarray, neighbours: np.ndarray, region:
 @compiled()
 def _star_shaped(polygon: np.ndarray) -> bool:
     """Whether a closed polygon about the origin winds around it once, always in the same direction."""
-    total, sign = 0.0, 0.0
-    for k in range(len(polygon)):
-        (ax, ay), (bx, by) = polygon[k - 1], polygon[k]
-        cross = ax * by - ay * bx
-        if cross == 0 or cross * sign < 0:
-            return False
-        sign = cross
-        total += np.arctan2(cross, ax * bx + ay * by)
-    return abs(abs(total) - 2 * np.pi) < 1e-6
+    x, y = polygon[:, 0], polygon[:, 1]
+    x0, y0 = np.roll(x, 1), np.roll(y, 1)
+    cross = x0 * y - y0 * x
+    turn = np.arctan2(cross, x0 * x + y0 * y).sum()
+    return ((cross > 0).all() or (cross < 0).all()) and abs(abs(turn) - 2 * np.pi) < 1e-6
 
 
 def _outline_region(nodes: np.ndarray, outmost: np.ndarray | None) -> np.ndarray | None:

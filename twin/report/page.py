@@ -11,7 +11,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import quote
@@ -22,6 +21,7 @@ from markupsafe import Markup, escape
 from twin.report.table import Column, Row, make_table
 from twin.report.themes import dark_of, stylesheet
 from twin.store import write_text
+from twin.store.made import program_version
 
 Kind = Literal["chart", "frame", "photo"]
 # Least number of sections of a page that has a table of contents.
@@ -148,11 +148,8 @@ class Page:
 
 def provenance(made_by: str) -> Markup:
     """The line that states the command, the version of this package and the time at which a page was made."""
-    try:
-        release = version("tactip-twin")
-    except PackageNotFoundError:  # the program runs from a source folder that was not installed
-        release = "(not installed)"
-    return Markup("Made by <code>{}</code>, tactip-twin {}, {:%Y-%m-%d %H:%M} UTC.").format(made_by, release, datetime.now(UTC))
+    made = "Made by <code>{}</code>, tactip-twin {}, {:%Y-%m-%d %H:%M} UTC."
+    return Markup(made).format(made_by, program_version(), datetime.now(UTC))
 
 
 def strong(text: object) -> Markup:

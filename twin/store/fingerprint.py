@@ -185,17 +185,12 @@ class _Module:
     names: Mapping[str, _From]
 
 
-def source_text(file: Path) -> str:
-    """Text of a module's file."""
-    return file.read_text(encoding="utf-8")
-
-
 @cache
 def _read_module(root: Path, file: Path, name: str) -> _Module:
     collecting = gc.isenabled()
     gc.disable()  # a syntax tree has many small objects, and garbage collection would double the time
     try:
-        tree = ast.parse(source_text(file))
+        tree = ast.parse(file.read_text(encoding="utf-8"))
         imports, names = _imports(tree, name, file.name == "__init__.py")
         digest = hashlib.sha256(_bare(tree).encode()).hexdigest()
     except (OSError, SyntaxError, UnicodeDecodeError) as error:

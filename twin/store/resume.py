@@ -81,10 +81,8 @@ def keep_arrays(folder: Path, item: Item, arrays: dict[str, np.ndarray]) -> Path
 
 def kept_arrays(folder: Path, item: Item, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """The arrays of ``compute()``. They are read from the folder if the same code stored them there, else computed and stored."""
-    found = find_arrays(folder, item)
-    if found is None:
-        found = compute()
-        keep_arrays(folder, item, found)
+    if (found := find_arrays(folder, item)) is None:
+        keep_arrays(folder, item, found := compute())
     return found
 
 
@@ -109,10 +107,8 @@ def keep_json(folder: Path, item: Item, content: object) -> Path:
 
 def kept_json(folder: Path, item: Item, compute: Callable[[], Any]) -> Any:
     """Result of ``compute()`` as JSON holds it. It is read from the folder if the same code stored it there, else computed and stored."""
-    found = find_json(folder, item)
-    if found is None:
-        found = compute()
-        keep_json(folder, item, found)
+    if (found := find_json(folder, item)) is None:
+        keep_json(folder, item, found := compute())
     return found
 
 

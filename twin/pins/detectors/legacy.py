@@ -6,7 +6,6 @@ origin; a frame is refused if the number of blobs is not exactly the sensor's; n
 """
 
 from dataclasses import dataclass
-from time import perf_counter
 
 import cv2
 import numpy as np
@@ -88,7 +87,6 @@ class LegacyObservation:
         Why the frame is not valid; empty if it is.
     graph : PinGraph or None
         Nodes, cells and areas are in the release's unit: px of the resized image, centred by the scalar median.
-    ms : dict of str to float
     """
 
     nodes_px: np.ndarray
@@ -96,7 +94,6 @@ class LegacyObservation:
     valid: bool
     reason: str
     graph: PinGraph | None
-    ms: dict[str, float]
 
 
 def legacy_detector(parameters: LegacyParameters) -> cv2.SimpleBlobDetector:
@@ -136,13 +133,11 @@ def legacy_graph(nodes: np.ndarray, parameters: LegacyParameters) -> PinGraph:
     diagram = Voronoi(extended)
     area, cells = np.full(n, np.nan), []
     for i in range(n):
-        region = diagram.regions[diagram.point_region[i]]
+        region, cell = diagram.regions[diagram.point_region[i]], np.empty((0, 2))
         if region and -1 not in region:
             cell = diagram.vertices[region]
             cell = cell[ConvexHull(cell).vertices]
             area[i] = ConvexHull(cell).volume
-        else:
-            cell = np.empty((0, 2))
         cells.append(cell)
     return PinGraph("voronoi", nodes, edges, area, cells)
 
@@ -180,22 +175,14 @@ class LegacyPipeline:
         if frame.form != Form.PROCESSED or frame.image.shape[1::-1] != self.size_px:
             raise FrameError(f"{frame.name or 'frame'}: the published method takes recordings of {self.size_px[0]}x{self.size_px[1]} only")
         n, size = self.count, self.parameters.size_px
-        started = perf_counter()
         gray = cv2.resize(gray_levels(frame.image), (size, size))
         _, binary = cv2.threshold(gray, self.parameters.threshold, 255, cv2.THRESH_BINARY)
         keypoints = self._detector.detect(cv2.bitwise_and(binary, self._mask))
         nodes = np.array([point.pt for point in keypoints], float).reshape(-1, 2)
-        ms = {"detect": 1e3 * (perf_counter() - started)}
-        scale = np.array(self.size_px) / size
-        nodes_px = (nodes + 0.5) * scale - 0.5
-        reason, graph = "", None
+        nodes_px = (nodes + 0.5) * (np.array(self.size_px) / size) - 0.5
         if len(nodes) != n:
-            reason = f"{len(nodes)} blobs found, exactly {n} expected"
-        else:
-            try:
-                graph = legacy_graph(nodes - np.median(nodes), self.parameters)
-            except QhullError:
-                reason = "the blobs have no tessellation"
-        ms["total"] = 1e3 * (perf_counter() - started)
-        ms["graph"] = ms["total"] - ms["detect"]
-        return LegacyObservation(nodes_px, len(nodes), not reason, reason, graph, ms)
+            return LegacyObservation(nodes_px, len(nodes), False, f"{len(nodes)} blobs found, exactly {n} expected", None)
+        try:
+            return LegacyObservation(nodes_px, n, True, "", legacy_graph(nodes - np.median(nodes), self.parameters))
+        except QhullError:
+            return LegacyObservation(nodes_px, n, False, "the blobs have no tessellation", None)

@@ -7,6 +7,7 @@ import numpy as np
 
 from scenes.sensor import BlobSpec
 from twin.compiled import compiled
+from twin.frames.forms import levels_at
 from twin.pins.finding.bumps import find_bumps
 
 MOST_COMPONENTS = 65535
@@ -199,12 +200,11 @@ def find_blobs(gray: np.ndarray, mask: Mask, blob: BlobSpec, *, max_area_px2: fl
     if blob.erosion_px > 1:
         eroded = cv2.erode(bright, np.ones((blob.erosion_px, blob.erosion_px), np.uint8))
     most = ((eroded.shape[0] + 1) // 2) * ((eroded.shape[1] + 1) // 2)  # one in each 2 x 2 pixels
-    if most < MOST_COMPONENTS:  # 16 bits are faster, but OpenCV refuses to run out of them
-        _, labels, boxes, _ = cv2.connectedComponentsWithStats(eroded, connectivity=8, ltype=cv2.CV_16U)
-    else:
-        _, labels, boxes, _ = cv2.connectedComponentsWithStats(eroded, connectivity=8, ltype=cv2.CV_32S)
-        labels[labels > MOST_COMPONENTS] = 0
-        labels, boxes = labels.astype(np.uint16), boxes[: MOST_COMPONENTS + 1]
+    numbers = cv2.CV_16U if most < MOST_COMPONENTS else cv2.CV_32S  # 16 bits are faster, but OpenCV refuses to run out of them
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(eroded, connectivity=8, ltype=numbers)
+    if numbers == cv2.CV_32S:
+        labels = np.where(labels > MOST_COMPONENTS, 0, labels).astype(np.uint16)
+        boxes = boxes[: MOST_COMPONENTS + 1]
     grow = 2 * blob.erosion_px + 1
     grown = cv2.copyTo(labels, eroded, cv2.dilate(labels, np.ones((grow, grow), np.uint8)))
     ringed = cv2.dilate(labels, np.ones((grow + 2 * RING_PX, grow + 2 * RING_PX), np.uint8))
@@ -218,8 +218,7 @@ def find_blobs(gray: np.ndarray, mask: Mask, blob: BlobSpec, *, max_area_px2: fl
 def find_spots(gray: np.ndarray, mask: Mask, blob: BlobSpec) -> Blobs:
     """Bright spots of the size ``blob.spot_sigma_px`` in a mask's window (h, w) uint8. All count as of one area."""
     spots = find_bumps(gray, blob.spot_sigma_px)
-    column, row = np.clip(np.round(spots.px).astype(int), 0, np.array(gray.shape[::-1]) - 1).T
-    px = spots.px[mask.disc[row, column] > 0]
+    px = spots.px[levels_at(mask.disc, spots.px) > 0]
     area = np.full(len(px), 2 * np.pi * blob.spot_sigma_px**2)
     nothing = np.zeros(gray.shape, np.uint16)
     label = np.zeros(len(px), int)

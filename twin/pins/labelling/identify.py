@@ -218,31 +218,31 @@ def identify(images: list[np.ndarray], *, progress: Step = unheard) -> Identifie
     FrameError
         No frame shows a layout.
     """
-    found, refused = _attempt(images, progress)
-    if found is not None and found.sure and found.best.pins.count >= FEWEST_VIEWED:
+    found = _attempt(images, progress)
+    if isinstance(found, Identified) and found.sure and found.best.pins.count >= FEWEST_VIEWED:
         return found
     inverted = [pin_levels(image, "dark") for image in images]
-    dark, _ = _attempt([inverted[k] for k in spread_indices(len(images), SIZED_ON)], unheard)
-    if dark is not None and len(images) > SIZED_ON and _better(dark, found):
-        dark, _ = _attempt(inverted, progress)
-    if dark is not None and _better(dark, found):
+    dark = _attempt([inverted[k] for k in spread_indices(len(images), SIZED_ON)], unheard)
+    if len(images) > SIZED_ON and _better(dark, found):
+        dark = _attempt(inverted, progress)
+    if isinstance(dark, Identified) and _better(dark, found):
         return replace(dark, polarity="dark")
-    if found is None:
-        raise refused or FrameError(NO_LAYOUT)
+    if isinstance(found, FrameError):
+        raise found
     return found
 
 
-def _attempt(images: list[np.ndarray], progress: Step) -> tuple[Identified | None, FrameError | None]:
+def _attempt(images: list[np.ndarray], progress: Step) -> Identified | FrameError:
     """The layout of bright pins in gray frames, or the reason why there is none."""
     try:
-        return _identify_bright(images, progress), None
+        return _identify_bright(images, progress)
     except FrameError as error:
-        return None, error
+        return error
 
 
-def _better(dark: Identified, bright: Identified | None) -> bool:
-    """Whether the best candidate of dark pins is better than that of bright ones, if there is one."""
-    return bright is None or _merit(dark.best) > _merit(bright.best)
+def _better(dark: Identified | FrameError, bright: Identified | FrameError) -> bool:
+    """Whether there is a candidate of dark pins that is better than the best one of bright pins, if there is one."""
+    return isinstance(dark, Identified) and (isinstance(bright, FrameError) or _merit(dark.best) > _merit(bright.best))
 
 
 def stand_out(images: list[np.ndarray], seen: Sequence[LayoutInFrame], sigma_px: float) -> bool:
@@ -285,10 +285,9 @@ def _identify_bright(images: list[np.ndarray], progress: Step) -> Identified:
     """
     searched = families()
     looks: list[Look] = [partial(_family_look, by) for by in searched]
-    sizes = [_best_size(images[k], looks) for k in spread_indices(len(images), SIZED_ON)]
-    if not any(sizes):
+    sigma = _usual_size(images, looks)
+    if not sigma:
         raise FrameError(f"none of {format_count(len(images), 'frames')} shows pins in rings, a hexagon or a grid; {NO_LAYOUT}")
-    sigma = float(np.median([size for size in sizes if size]))
     spots = _spots(images, sigma)
     found: list[tuple[PinsSpec, list[LayoutInFrame]]] = []
     for k, by in enumerate(searched):
@@ -377,10 +376,9 @@ def score_layout(pins: PinsSpec, images: list[np.ndarray]) -> Candidate | None:
 def _score_layout(pins: PinsSpec, by: Family, images: list[np.ndarray]) -> Candidate | None:
     """How well a given layout explains frames whose spots are labelled by a family."""
     look = partial(_layout_look, pins, by)
-    sizes = [size for k in spread_indices(len(images), SIZED_ON) if (size := _best_size(images[k], [look]))]
-    if not sizes:
+    sigma = _usual_size(images, [look])
+    if not sigma:
         return None
-    sigma = float(np.median(sizes))
     spots = _spots(images, sigma)
     seen = [shown for one in spots if (shown := look(one)) is not None]
     layout = _candidate(pins, seen, spots, may_miss=False) if seen else None
@@ -395,9 +393,15 @@ def _spots(images: list[np.ndarray], sigma_px: float) -> list[Bumps]:
     return [replace(one, hidden=hidden) for one in found]
 
 
-def _best_size(image: np.ndarray, looks: list[Look]) -> float | None:
-    """The size of spots with the most pins seen, minus pins not seen and left-over spots; None if no layout is seen."""
-    best, most = None, 0
+def _usual_size(images: list[np.ndarray], looks: list[Look]) -> float:
+    """The size of spots of some of the frames, their median; 0 if no layout is seen."""
+    sizes = [size for k in spread_indices(len(images), SIZED_ON) if (size := _best_size(images[k], looks))]
+    return float(np.median(sizes)) if sizes else 0.0
+
+
+def _best_size(image: np.ndarray, looks: list[Look]) -> float:
+    """The size of spots with the most pins seen, minus pins not seen and left-over spots; 0 if no layout is seen."""
+    best, most = 0.0, 0
     for size in (share * max(image.shape) for share in SIZES):
         spots = recent_bumps(image, size)
         for look in looks:
@@ -411,15 +415,19 @@ def _best_size(image: np.ndarray, looks: list[Look]) -> float | None:
 
 def _family_look(by: Family, spots: Bumps) -> LayoutInFrame | None:
     """The part of a family's lattice in one frame, without the other frames; None if there is none."""
-    spot = label_spots(spots, by)
-    part = None if spot is None else _part(by, spots, spot)
+    part = _part(by, spots)
     return None if part is None else part[1]
 
 
 def _layout_look(pins: PinsSpec, by: Family, spots: Bumps) -> LayoutInFrame | None:
-    """A given layout in one frame, without the other frames; None if it is not seen."""
-    spot = label_spots(spots, by)
-    return None if spot is None else _as_layout(pins, by, spots, spot)
+    """A given layout of a family in one frame, at the position with most labels; None if it is not seen, or the lattice is too small."""
+    spot, shape = label_spots(spots, by), pins.shape
+    if spot is None:
+        return None
+    if by.kind is None or not isinstance(shape, LatticeLayout):
+        return _place_lattice(spots, spot, by, np.arange(len(by.lattice)))
+    nodes = shape.at_most_labels(spot >= 0)
+    return None if nodes is None else _place_lattice(spots, spot, by, np.delete(nodes, list(pins.missing)))
 
 
 def _place_lattice(spots: Bumps, spot: np.ndarray, by: Family, nodes: np.ndarray) -> LayoutInFrame:
@@ -448,14 +456,16 @@ def _first_guesses(by: Family, spots: list[Bumps]) -> list[tuple[PinsSpec, list[
     """The two layouts of one family that explain most if each frame is labelled by itself."""
     votes: dict[PinsSpec, list[LayoutInFrame]] = {}
     for one in spots:
-        spot = label_spots(one, by)
-        if spot is not None and (part := _part(by, one, spot)) is not None:
+        if (part := _part(by, one)) is not None:
             votes.setdefault(part[0], []).append(part[1])
     return sorted(votes.items(), key=lambda vote: -sum(seen.explained for seen in vote[1]))[:2]
 
 
-def _part(by: Family, spots: Bumps, spot: np.ndarray) -> tuple[PinsSpec, LayoutInFrame] | None:
-    """The part of a lattice in a frame: the layout, and its pins in the frame."""
+def _part(by: Family, spots: Bumps) -> tuple[PinsSpec, LayoutInFrame] | None:
+    """The part of a lattice in a frame: the layout, and its pins in the frame; None if there is none."""
+    spot = label_spots(spots, by)
+    if spot is None:
+        return None
     part = by.kind.find(spot >= 0, in_view(locate_places(by.lattice, by.around, spots.px, spot, spots.size_px), spots)) if by.kind else None
     return None if part is None else (_pins_of(part[0]), _place_lattice(spots, spot, by, part[1]))
 
@@ -464,15 +474,6 @@ def _pins_of(shape: LatticeLayout) -> PinsSpec:
     """Pins of a layout."""
     name = next(name for name, kind in PinsSpec.parts().items() if kind is type(shape))
     return PinsSpec.model_validate({"layout": name, **shape.model_dump()})
-
-
-def _as_layout(pins: PinsSpec, by: Family, spots: Bumps, spot: np.ndarray) -> LayoutInFrame | None:
-    """A given layout of a family in a labelled frame, at the position with most labels; None if the lattice is too small for it."""
-    shape = pins.shape
-    if by.kind is None or not isinstance(shape, LatticeLayout):
-        return _place_lattice(spots, spot, by, np.arange(len(by.lattice)))
-    nodes = shape.at_most_labels(spot >= 0)
-    return None if nodes is None else _place_lattice(spots, spot, by, np.delete(nodes, list(pins.missing)))
 
 
 def _candidate(pins: PinsSpec, seen: list[LayoutInFrame], spots: list[Bumps], *, may_miss: bool = True) -> Candidate:
@@ -580,13 +581,14 @@ def _turned_alike(pins: PinsSpec, seen: list[LayoutInFrame]) -> list[LayoutInFra
     frame that the layout explains best."""
     orders = symmetries(pins)
     guide = max(seen, key=lambda one: one.explained).places_px
-    out = []
-    for one in seen:
-        with np.errstate(invalid="ignore"):
-            away = [np.linalg.norm(one.places_px[order] - guide, axis=1) for order in orders]
-        order = orders[int(np.argmin([np.median(a[np.isfinite(a)]) if np.isfinite(a).any() else np.inf for a in away]))]
-        out.append(replace(one, pins_px=one.pins_px[order], places_px=one.places_px[order]))
-    return out
+    chosen = [order_like(orders, one.places_px, guide) for one in seen]
+    return [replace(one, pins_px=one.pins_px[order], places_px=one.places_px[order]) for one, order in zip(seen, chosen, strict=True)]
+
+
+def order_like(orders: list[np.ndarray], pins_px: np.ndarray, like_px: np.ndarray) -> np.ndarray:
+    """The one of some orders (N,) of pins (N, 2), NaN where unknown, in which they are nearest to ``like_px`` (N, 2), by the median."""
+    away = [np.linalg.norm(pins_px[order] - like_px, axis=1) for order in orders]
+    return orders[int(np.argmin([np.nanmedian(each) if np.isfinite(each).any() else np.inf for each in away]))]
 
 
 def smooth_view(places: np.ndarray, px: np.ndarray) -> np.ndarray:

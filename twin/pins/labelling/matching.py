@@ -27,8 +27,8 @@ from scipy.spatial import cKDTree
 
 from twin.compiled import compiled
 from twin.geometry.drift import drift
-from twin.pins.labelling.buckets import Buckets, fill_buckets, nearest_free
-from twin.pins.labelling.reference import Reference, median_px, turned_over
+from twin.pins.labelling.buckets import Buckets, blobs_near, fill_buckets, nearest_free
+from twin.pins.labelling.reference import Reference, count_turned_over, median_px
 
 RIDGE = 0.25
 """Penalty of the local gradient, which draws it towards zero. It is equivalent to this many neighbours at a distance of one spacing."""
@@ -220,13 +220,13 @@ def proven(reference: Reference, px: np.ndarray, blob: np.ndarray) -> bool:
     known = blob >= 0
     if known.sum() < min(len(blob), len(px)):
         return False
-    return not known.any() or not turned_over(reference, px[blob], known).any()
+    return not known.any() or not count_turned_over(px[blob], reference.triangles, known)
 
 
 def look_again(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: Match) -> Match:
     """The labelling to which the pins drift, or ``found`` if that holds as many pins without turning a triangle over."""
     before = found.blob >= 0
-    folded = not before.any() or turned_over(reference, px[found.blob], before).any()
+    folded = not before.any() or count_turned_over(px[found.blob], reference.triangles, before) > 0
     doubtful = folded or before.mean() < 1 - MOST_LOST
     labelled = _drift_labelling(reference, px, area_px2, STIFFNESS if doubtful else STIFFNESS[:1])
     if labelled is None:
@@ -269,7 +269,7 @@ def _drift_labelling(
             continue
         left = np.delete(blobs, found[known], axis=0)
         beside = int((((left - places[:, None]) ** 2).sum(axis=2).min(axis=0) < 1).sum()) if len(left) else 0
-        folded = turned_over(reference, np.where(known[:, None], blobs[found], places), known).any()
+        folded = count_turned_over(blobs[found], reference.triangles, known)
         if beside <= MOST_LEFT * n and not folded:
             best, most = (np.where(known, caps[found], -1), places * spacing), known.sum() + 1
             if known.sum() == min(n, len(caps)):
@@ -621,17 +621,14 @@ def _trust(layout: LayoutArrays, px: np.ndarray, blob: np.ndarray) -> tuple[np.n
 @compiled()
 def _candidates(
     layout: LayoutArrays, of_frame: FrameBlobs, predicted: np.ndarray, blob: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
-    """Possible pairs within the gate: pins, blobs and costs (p,), and whether a pin or blob is in more than one of them."""
-    neighbours, spacing, px, area, cell, n = layout.neighbours, layout.spacing, of_frame.px, of_frame.area, of_frame.cell, len(predicted)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Possible pairs within the gate: pins, blobs and costs (p,)."""
+    neighbours, spacing, px, area = layout.neighbours, layout.spacing, of_frame.px, of_frame.area
     # numba needs lists of a known type, also empty ones
     pins: list[int] = [0 for _ in range(0)]
     blobs: list[int] = [0 for _ in range(0)]
     costs: list[float] = [0.0 for _ in range(0)]
-    head, following, x0, y0, columns, rows = of_frame.buckets
-    uses = np.zeros(len(px), np.int64)
-    contested = False
-    for i in range(n):
+    for i in range(len(predicted)):
         x, y = predicted[i, 0], predicted[i, 1]
         if not np.isfinite(x + y):
             continue
@@ -642,32 +639,21 @@ def _candidates(
                 total += area[j]
                 count += 1
         expected = total / max(count, 1)
-        reach = FINAL_GATE * spacing[i]
-        mine = 0
-        for cy in range(max(int((y - reach - y0) / cell), 0), min(int((y + reach - y0) / cell), rows - 1) + 1):
-            for cx in range(max(int((x - reach - x0) / cell), 0), min(int((x + reach - x0) / cell), columns - 1) + 1):
-                k = head[cy * columns + cx]
-                while k >= 0:
-                    d2 = (px[k, 0] - x) ** 2 + (px[k, 1] - y) ** 2
-                    if d2 < reach * reach and area[k] >= MIN_AREA_RATIO * expected:
-                        pins.append(i)
-                        blobs.append(k)
-                        costs.append(d2 / (spacing[i] * spacing[i]) + AREA_LOG_WEIGHT * np.log(area[k] / expected) ** 2)
-                        mine += 1
-                        uses[k] += 1
-                        contested = contested or mine > 1 or uses[k] > 1
-                    k = following[k]
-    return np.array(pins), np.array(blobs), np.array(costs), contested
+        for k, d2 in blobs_near(x, y, FINAL_GATE * spacing[i], px, of_frame.buckets, of_frame.cell):
+            if area[k] >= MIN_AREA_RATIO * expected:
+                pins.append(i)
+                blobs.append(k)
+                costs.append(d2 / (spacing[i] * spacing[i]) + AREA_LOG_WEIGHT * np.log(area[k] / expected) ** 2)
+    return np.array(pins), np.array(blobs), np.array(costs)
 
 
-def _assign(n: int, blob_count: int, pins: np.ndarray, blobs: np.ndarray, costs: np.ndarray, contested: bool) -> np.ndarray:
+def _assign(n: int, blob_count: int, pins: np.ndarray, blobs: np.ndarray, costs: np.ndarray) -> np.ndarray:
     """One-to-one assignment (N,) of possible pairs (p,): as many pairs as possible, with the least cost."""
     blob = np.full(n, -1)
-    if not contested:
-        blob[pins] = blobs
-        return blob
     open_pair = (np.bincount(pins, minlength=n)[pins] > 1) | (np.bincount(blobs, minlength=blob_count)[blobs] > 1)
     blob[pins[~open_pair]] = blobs[~open_pair]
+    if not open_pair.any():
+        return blob
     row_pin, row = np.unique(pins[open_pair], return_inverse=True)
     column_blob, column = np.unique(blobs[open_pair], return_inverse=True)
     table = np.full((len(row_pin), len(column_blob)), NO_PAIR_COST)

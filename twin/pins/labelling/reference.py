@@ -14,7 +14,7 @@ from twin.errors import FrameError
 from twin.frames.forms import form_named
 from twin.geometry.drift import coherent_motions
 from twin.geometry.pins import pin_lattice, rest_pins
-from twin.pins.flips import Net, net_of
+from twin.pins.flips import Net, double_area, net_of
 from twin.pins.voronoi import voronoi
 from twin.types import Form
 
@@ -183,30 +183,17 @@ def _turned_alike(px: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 @compiled()
-def _double_area(px: np.ndarray, triangle: np.ndarray) -> float:
-    """Twice the signed area of a triangle (3,) over points (N, 2)."""
-    (ax, ay), (bx, by), (cx, cy) = px[triangle[0]], px[triangle[1]], px[triangle[2]]
-    return (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-
-
-@compiled()
-def _turned_over(px: np.ndarray, triangles: np.ndarray, known: np.ndarray) -> np.ndarray:
-    over = np.zeros(len(triangles), np.bool_)
-    for t in range(len(triangles)):
-        a, b, c = triangles[t]
-        over[t] = known[a] and known[b] and known[c] and _double_area(px, triangles[t]) <= 0
-    return over
-
-
-def turned_over(reference: Reference, nodes_px: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
-    """Triangles (t,) bool of the reference whose orientation is reversed when the pins move to ``nodes_px`` (N, 2).
+def count_turned_over(px: np.ndarray, triangles: np.ndarray, known: np.ndarray) -> int:
+    """Number of triangles (t, 3) of pins whose orientation is reversed when the pins move to ``px`` (N, 2).
 
     Only those count whose three pins are ``known`` (N,) bool.
     """
-    over: np.ndarray = _turned_over(nodes_px, reference.triangles, np.ones(len(nodes_px), bool) if known is None else known)
-    return over
+    count = 0
+    for a, b, c in triangles:
+        count += known[a] and known[b] and known[c] and double_area(px, a, b, c) <= 0
+    return count
 
 
 def folded_fraction(reference: Reference, nodes_px: np.ndarray) -> float:
     """Share of the reference's triangles whose orientation is reversed when the pins move to ``nodes_px`` (N, 2)."""
-    return float(np.mean(turned_over(reference, nodes_px)))
+    return float(count_turned_over(nodes_px, reference.triangles, np.ones(len(nodes_px), bool)) / len(reference.triangles))

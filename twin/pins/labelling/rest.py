@@ -8,7 +8,7 @@ import numpy as np
 from scenes.pins import PinsSpec
 from twin.errors import FrameError
 from twin.geometry.pins import pin_lattice
-from twin.pins.labelling.identify import SHOWN, Candidate, score_layout, symmetries, unevenness
+from twin.pins.labelling.identify import SHOWN, Candidate, order_like, score_layout, symmetries, unevenness
 from twin.pins.labelling.reference import mean_radius
 from twin.pins.labelling.view import MOST_UNEVEN, uneven_dent
 
@@ -78,14 +78,13 @@ def rest_of(layout: Candidate, names: list[str], given: np.ndarray | None = None
                 "give another one"
             )
         require_even(layout.pins, shown.seen[0].pins_px, given_name)
-        return Rest(_alike(layout, shown.seen[0].pins_px), "given", given_name)
+        seen_px = shown.seen[0].pins_px
+        return Rest(seen_px[order_like(symmetries(layout.pins), seen_px, layout.rest_px)], "given", given_name)
     places = pin_lattice(layout.pins).places
-    good = [k for k, seen in enumerate(layout.seen) if seen.explained >= SHOWN]
-    if good:
-        even = [k for k in good if unevenness(places, layout.seen[k].pins_px) < STILL]
-        if even:
-            still = min(even, key=lambda k: spread_of(layout.pins, layout.seen[k].pins_px))
-            return Rest(layout.seen[still].pins_px, "found", names[still])
+    even = [k for k, one in enumerate(layout.seen) if one.explained >= SHOWN and unevenness(places, one.pins_px) < STILL]
+    if even:
+        still = min(even, key=lambda k: spread_of(layout.pins, layout.seen[k].pins_px))
+        return Rest(layout.seen[still].pins_px, "found", names[still])
     return Rest(rest_from_contacts(layout), "made")
 
 
@@ -145,13 +144,6 @@ def spread_of(pins: PinsSpec, pins_px: np.ndarray) -> float:
     inner = known & (np.linalg.norm(lattice.places, axis=1) < INNER)
     rim = lattice.outmost[known[lattice.outmost]]
     return mean_radius(pins_px[inner]) / mean_radius(pins_px[rim]) if inner.any() and len(rim) else np.inf
-
-
-def _alike(layout: Candidate, pins_px: np.ndarray) -> np.ndarray:
-    """Pins (N, 2) of another frame, in the order that fits the layout's pins at rest best. All symmetries of the layout are tried."""
-    orders: list[np.ndarray] = symmetries(layout.pins)
-    away = [float(np.nanmedian(np.linalg.norm(pins_px[order] - layout.rest_px, axis=1))) for order in orders]
-    return pins_px[orders[int(np.argmin(away))]]
 
 
 def turn_of(pins: PinsSpec, pins_px: np.ndarray) -> float:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from twin.frames.forms import levels_at
 from twin.pins.finding.blobs import Blobs
 from twin.pins.labelling.matching import Match
 from twin.pins.labelling.reference import Reference
@@ -165,11 +166,8 @@ def _bright_around(reference: Reference, blobs: Blobs, found: Match, pins: list[
     Touching caps form a chain or a small clump. Half of the way to most of its neighbours, a cap's surroundings are dark.
     """
     middle = (centers[:, None] + found.predicted_px[reference.neighbours[pins, :AROUND_PART]]) / 2
-    last = np.array(blobs.gray.shape[::-1]) - 1
-    column, row = np.moveaxis(np.clip(np.round(np.nan_to_num(middle - blobs.corner_px)), 0, last).astype(int), -1, 0)
-    between = blobs.gray[row, column].astype(float)
-    column, row = np.clip(np.round(centers - blobs.corner_px), 0, last).astype(int).T
-    height = blobs.gray[row, column, None] - np.sort(between, axis=1)
+    between = levels_at(blobs.gray, np.nan_to_num(middle - blobs.corner_px))
+    height = levels_at(blobs.gray, centers - blobs.corner_px)[:, None] - np.sort(between, axis=1)
     return bool(np.mean(height[:, AROUND_PART // 2] <= LEAST_ABOVE * height[:, 0].max()) > MOST_BRIGHT)
 
 

@@ -156,7 +156,7 @@ class NewSensor:
 
     def lines(self) -> list[str]:
         """The results and the doubts about them, as lines of text."""
-        lines = [f"{'sure' if self.identified.sure else 'unsure'}: {self.identified.best.line()}"]
+        lines = [f"layout {'sure' if self.identified.sure else 'unsure'}: {self.identified.best.line()}"]
         lines += [f"doubt: {doubt}" for doubt in self.identified.doubts]
         if not self.identified.sure:
             lines += [f"or: {other.line()}" for other in self.identified.candidates[1:2]]

@@ -87,7 +87,7 @@ def with_other_names(data):
 CHANGES = {
     "other labels": with_other_labels,
     "other labels ": with_other_moves,
-    "other frames under the same names": with_another_frame,
+    "other frames, or other pins found in them, under the same names": with_another_frame,
     "frames of other names": with_other_names,
 }
 

@@ -14,7 +14,7 @@ from twin.store import inputs_digest
 DIGESTS = {  # keys of the digests in a run's configuration, with the words for a message about a difference
     "names": "frames of other names",
     "labels": "other labels",
-    "frames": "other frames under the same names",
+    "frames": "other frames, or other pins found in them, under the same names",
 }
 ASIDE = ("problems", "data")  # keys of a run's configuration that do not affect its result
 COUNTED = "parameters"  # key that only a finished run's configuration has: the number of parameters of its networks

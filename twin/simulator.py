@@ -17,11 +17,10 @@ from twin.compiled import begin_compiling
 from twin.errors import ContactError, FrameError, OptionError
 from twin.frames.forms import form_named, frame_size
 from twin.frames.images import write_image
-from twin.mechanics.balance import Friction
-from twin.mechanics.batch import ContactJob, press_many
+from twin.mechanics.law import Friction
 from twin.mechanics.newton import GAP_BOUND_MM, RESIDUAL_TOLERANCE
 from twin.mechanics.path import ContactPath, ContactPose
-from twin.mechanics.solver import SkinSolver
+from twin.mechanics.solver import ContactJob, SkinSolver, press_many
 from twin.optics.preview import Shading
 from twin.optics.render import Renderer
 from twin.progress import Progress, silent, stage

@@ -12,7 +12,7 @@ from hardware.rig.geometry import PlacedObject
 from hardware.workcell.build import twin_camera
 from scenes import ObjectSpec, SensorSpec, ServoSpec, load_experiment
 from twin.errors import OptionError
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.types import Form
 
 # Largest age, s, of feedback that is used.

@@ -7,7 +7,7 @@ import numpy as np
 from scenes.object import ObjectSpec
 from scenes.servo import PlacementSpec
 from twin.rig.arm_pose import matrix_of, pose_of
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.rig.touch import SmoothSurface, TrueTouch
 
 

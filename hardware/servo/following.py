@@ -34,7 +34,7 @@ from twin.report.charts import write_chart
 from twin.report.page import Page, PagePicture
 from twin.report.table import Cell, Column, write_rows
 from twin.rig.arm_pose import matrix_of, pose_of
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.store import write_json, writes
 from twin.types import FIRST, Frame, ReadableResult
 

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from scenes.servo import ServoSpec
 from twin.rig.arm_pose import matrix_of, pose_of
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from hardware.workcell.mover import MOVE_TIMEOUT_S, Mover
 from scenes.servo import ServoSpec
 from twin.errors import ErrorsAs
 from twin.estimate import Estimate, Estimator
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.types import Frame
 
 LOG = logging.getLogger(__name__)

@@ -17,7 +17,7 @@ from twin.report.charts import muted_colour, new_figure
 from twin.report.table import write_table
 from twin.report.themes import BLUE, RED
 from twin.rig.arm_pose import matrix_of
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 
 # Number of points in a window of the local smoothness.
 LOCAL_N = 9

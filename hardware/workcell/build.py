@@ -39,7 +39,7 @@ from twin.optics.preview import Preview
 from twin.optics.render import traced_shading
 from twin.pins import Pipeline
 from twin.rig.arm_pose import matrix_of
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.types import FIRST, NONE, Form, Frame
 
 # Value of ``camera`` that selects the twin.

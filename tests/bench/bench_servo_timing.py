@@ -63,7 +63,7 @@ def once(ros2: bool = False) -> dict[str, float]:
     from hardware.workcell.build import Rig
     from scenes import load_experiment, load_object, load_sensor, load_servo
     from twin.pins import Pipeline
-    from twin.rig.mounting import Mounting
+    from twin.rig.kinematics import Mounting
     from twin.types import Form
 
     servo = load_servo("surface")

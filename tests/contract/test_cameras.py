@@ -37,7 +37,7 @@ from twin.contracts import CameraContract
 from twin.errors import FrameError
 from twin.frames.images import write_image
 from twin.records.session import SessionWriter
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.types import Form, Frame
 
 COUNT = 6  # frames of the recorded sources

@@ -33,7 +33,7 @@ from hardware.servo.step import LoopHooks, LoopSettings
 from hardware.workcell.build import Rig, check_plan
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 from twin.pins import Pipeline, measure_reference, nominal_reference
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.types import Form
 
 RUNS, HEALTHY_RUNS = 320, 20

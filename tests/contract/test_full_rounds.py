@@ -19,7 +19,7 @@ from hardware.servo.loop import ServoLoop
 from hardware.servo.step import LoopSettings
 from hardware.workcell.build import Rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 
 OBJECTS = ("can", "mesh-can", "square", "prism", "tin-box")
 SPEED = 20.0  # of the emulated arm, times real

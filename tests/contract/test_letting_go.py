@@ -27,7 +27,7 @@ from hardware.servo.loop import ServoLoop
 from hardware.servo.step import LoopHooks, LoopSettings
 from hardware.workcell.build import Rig
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.signals import signals_as_ctrl_c
 from twin.types import Form
 

@@ -21,7 +21,7 @@ from hardware.servo.trajectory import measure, trajectory_of, write_csv
 from hardware.workcell.build import Rig
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 from twin.records.session import Session, SessionWriter
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 
 SPEED = 20.0  # of the simulated arm, times real
 ALLOCATOR_BYTES = 4_000_000  # that it may take at a time

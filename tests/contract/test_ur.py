@@ -24,7 +24,7 @@ from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import SafeArm
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.errors import ExtraError
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 
 HOME = np.array([100.0, -500, 200, 0, 0, -160])
 AWAY = HOME + [0, 200, 0, 0, 0, 0]

@@ -43,7 +43,7 @@ from hardware.servo.loop import ServoLoop
 from hardware.servo.step import LoopHooks, LoopSettings
 from hardware.workcell.build import Rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.types import Form
 
 CAMERA_FAULTS = {

@@ -65,7 +65,7 @@ from hardware.emulators.twin_camera import FeedbackPose
 from hardware.workcell.build import twin_camera
 from hardware.rig.geometry import PlacedObject
 from scenes import load_experiment, load_object, load_sensor, load_servo
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.types import Form
 arm, port, sensor, thing, servo, fps = sys.argv[1:]
 spec, how = load_sensor(sensor), load_servo(servo)

@@ -26,7 +26,7 @@ from hardware.servo.trajectory import measure, trajectory_of
 from hardware.workcell.build import Rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.pins import Pipeline
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.types import Form
 
 FIRST_S = 90.0  # kernels may have to be compiled

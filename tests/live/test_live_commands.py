@@ -47,7 +47,7 @@ from twin.pins import Pipeline
 from twin.pins.batch import voronoi_map
 from twin.records import open_records
 from twin.records.ros2_messages import decode
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.studio.live_page import LivePage, frame_pictures
 from twin.types import Form, Frame
 

@@ -24,7 +24,7 @@ from training.surrogate.solids import Drum, Ellipsoid, SweptBox, distances_to
 from twin.errors import ContactError, OptionError
 from twin.geometry.pins import rest_pins
 from twin.mechanics.path import ContactPose
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.simulator import Simulator
 from twin.types import Form
 

@@ -86,7 +86,7 @@ PARTICIPLES_ALLOWED = {
     ("twin/evaluation/degradation/conditions/skin.py", "faded"),
     ("twin/evaluation/degradation/conditions/skin.py", "swollen"),
     ("twin/evaluation/degradation/conditions/skin.py", "torn"),
-    ("twin/optics/defocus.py", "defocused"),
+    ("twin/optics/preview.py", "defocused"),
     ("twin/pins/labelling/matching.py", "proven"),
     ("twin/types.py", "undeformed"),
 }

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.rig.touch import SmoothSurface
 from twin.types import FloatArray
 

@@ -123,7 +123,7 @@ class LinearContacts:
     radius_mm : float
         Radius of the dome.
     kind : (B,) int
-        Kinds of the solids (see ``twin.objects.kernels.solid``).
+        Kinds of the solids (see ``twin.objects.analytic.solid``).
     sizes : (B, SIZES) float
         Parameters that give the solids' sizes.
     friction, compliance_mm_per_n : (B,) float

@@ -18,9 +18,8 @@ from scipy import sparse
 from scenes.sensor import BackgroundSpec, ReliefSpec, SensorSpec
 from twin.camera.capture import expose
 from twin.evaluation.pictures.aligned import SATURATED, Aligned, levels_slope, with_changes
-from twin.optics.measured import picture_of
 from twin.optics.relief import POWER, CapLamp, cap_places, tiles_picture
-from twin.optics.static_layer import BACKGROUND_POWER
+from twin.optics.static_layer import BACKGROUND_POWER, picture_of
 from twin.types import BoolArray, FloatArray, IntArray
 
 CELLS, REACH = 23, 1.8

@@ -25,8 +25,8 @@ from twin.frames.images import write_image
 from twin.frames.tables import numbers
 from twin.records.folder import AGAIN, PicturesWriter, episode_of, format_of, read_facts, read_json, read_sidecar
 from twin.records.record import CHANNELS, NOMINAL_HZ, About, Channel, Episode, RecordError, Records, RecordStep, digest, float32, seconds
+from twin.rig.kinematics import Mounting
 from twin.rig.labels import as_executed, read_executed
-from twin.rig.mounting import Mounting
 from twin.store import text_file, write_json, write_npz
 from twin.types import Form
 

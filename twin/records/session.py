@@ -26,7 +26,7 @@ from twin.frames.forms import times
 from twin.frames.images import read_image, write_image
 from twin.frames.videos import describe_pauses
 from twin.records.record import CHANNELS, POSE_AXES, About, Episode, Records, RecordStep, digest, float32, seconds
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.store import contents, write_json, writing
 from twin.types import Form, Frame
 

@@ -25,8 +25,7 @@ from twin.mechanics.path import ContactPath, deepest_mm
 from twin.mechanics.solver import SkinSolver
 from twin.objects import build_field
 from twin.pins import Pipeline
-from twin.rig.kinematics import rig_of
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting, rig_of
 from twin.rig.touch import SmoothSurface, surface_labels, tilted_labels
 from twin.studio.camera import StudioCamera
 from twin.studio.pose import ObjectPose, bend_mm, motion_mm

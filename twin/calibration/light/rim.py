@@ -6,7 +6,7 @@ from scenes.sensor import CameraSpec, HousingSpec, RimSpec, SensorSpec
 from twin.camera.capture import expose
 from twin.camera.projection import sensor_to_camera
 from twin.evaluation.pictures.aligned import SATURATED, Aligned, to_light, with_changes
-from twin.optics.glass.lens import ray_table
+from twin.optics.glass import ray_table
 from twin.optics.static_layer import RIM_UNIT, rim_places, static_layer
 
 # Distances from the edge of the housing's opening, inwards and outwards, that the table covers, mm. No pin comes so near to the edge.

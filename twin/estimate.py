@@ -29,7 +29,8 @@ class Estimate(Protocol):
     """An estimator's result on a frame (``training.estimate.estimator.PoseEstimate``)."""
 
     @property
-    def names(self) -> tuple[str, ...]: ...
+    def names(self) -> tuple[str, ...]:
+        """Names of the labels."""
 
     @property
     def units(self) -> tuple[str, ...]: ...

@@ -24,8 +24,7 @@ from twin.camera.capture import CHROMA_RANGE, LUMA_RANGE, before_stream, expose,
 from twin.camera.projection import Disc, lens_disc
 from twin.camera.residual import LEAK, LEVELS, MIDDLE, MOST_LEVELS, STEEPNESS, differences, with_residual
 from twin.errors import FrameError, format_count
-from twin.evaluation.pictures.aligned import with_changes
-from twin.evaluation.pictures.frames import read_real
+from twin.evaluation.pictures.aligned import read_real, with_changes
 from twin.evaluation.pictures.images import compare_images
 from twin.frames.recording import BadFrame
 from twin.mechanics.skin_fit import SkinFit

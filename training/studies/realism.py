@@ -13,10 +13,10 @@ from training.data.two_sample import SMALL, TwoSample, accuracy_text, evaluate_c
 from twin.camera.projection import lens_disc
 from twin.errors import OptionError, format_count
 from twin.evaluation.pictures import report
+from twin.evaluation.pictures.aligned import FEW_LOST, read_real
 from twin.evaluation.pictures.compare import fixed_residual, statistics
 from twin.evaluation.pictures.compare import pin_aligned as align_pins
 from twin.evaluation.pictures.compare import pose_aligned as align_poses
-from twin.evaluation.pictures.frames import FEW_LOST, read_real
 from twin.optics.relief import without as plain_of
 from twin.progress import Progress, Step, silent, stage
 from twin.store import writes

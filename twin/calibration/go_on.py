@@ -102,7 +102,8 @@ def whole_sensor(
     FrameError, OptionError
         As ``new_sensor``, ``calibrate_optics`` and ``calibrate_to_file``; or the labels of no experiment vary like the table's.
     """
-    at = frames_at(frames, labels or table, no_contact)
+    table = labels or table
+    at = frames_at(frames, table, no_contact)
     if optics and open_recording(at, form=form).form == Form.PROCESSED:
         raise OptionError(
             f"{frames}: thresholded frames contain nothing about light and colours; leave out `optics`, or give raw camera frames"
@@ -110,15 +111,7 @@ def whole_sensor(
     if labels is not None and experiment is None:
         experiment = experiment_like(open_recording(at, form=form).labels)
     made = new_sensor(
-        frames,
-        out,
-        layout=layout,
-        radius_mm=radius_mm,
-        no_contact=no_contact,
-        table=labels or table,
-        form=form,
-        limit=limit,
-        progress=progress,
+        frames, out, layout=layout, radius_mm=radius_mm, no_contact=no_contact, table=table, form=form, limit=limit, progress=progress
     )
     sensor, light, contact = made.sensor, None, None
     if optics:
@@ -150,7 +143,7 @@ def experiment_like(labels: Mapping[str, np.ndarray]) -> ExperimentSpec:
     OptionError
         The table has no labels of contacts, or no experiment has similar labels.
     """
-    varying = {name for name in LABELS if _varies(labels.get(name))}
+    varying = {name for name in LABELS if name in labels and _varies(numbers(labels[name]))}
     if not varying:
         raise OptionError(
             "no label of a contact varies in the table; expected pose_1..6 and move_1..6, or pose_x..pose_Rz and shear_x..shear_Rz"
@@ -170,7 +163,6 @@ def experiment_like(labels: Mapping[str, np.ndarray]) -> ExperimentSpec:
     return load_experiment(name)
 
 
-def _varies(cells: np.ndarray | None) -> bool:
-    values = np.zeros(1) if cells is None else numbers(cells)
-    values = values[np.isfinite(values)]
-    return bool(len(values) and np.ptp(values) > VARIES)
+def _varies(values: np.ndarray) -> bool:
+    known = values[np.isfinite(values)]
+    return bool(len(known) and np.ptp(known) > VARIES)

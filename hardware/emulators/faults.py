@@ -1,5 +1,7 @@
-"""What all emulated devices have: faults, switched on by name (``NAME`` or ``NAME=VALUE``), and a start and an end."""
+"""What all emulated devices have: faults, switched on by name (``NAME`` or ``NAME=VALUE``), a start, an end, and a run until a signal."""
 
+import signal
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,8 +9,12 @@ from difflib import get_close_matches
 from threading import Timer
 from typing import Self
 
+from hardware.errors import DeviceError
 from scenes.files import quote
 from twin.errors import ErrorsAs, TwinError
+
+SLOWEST, FASTEST = 1e-3, 1e3  # limits of the time scale: beyond them a move takes hours, or no time at all
+CHECK_S = 0.1  # interval, s, at which signals and a failure of the emulator are checked
 
 
 @dataclass(frozen=True)
@@ -121,7 +127,18 @@ class Faults:
 
 
 class Emulator(ABC):
-    """An emulated device. A context manager, which works between ``start`` and ``stop``."""
+    """An emulated device. A context manager, which works between ``start`` and ``stop``.
+
+    Attributes
+    ----------
+    place : str
+        What listens, and where, from ``start`` on.
+    error : Exception or None
+        The error with which the device ended by itself.
+    """
+
+    place = ""
+    error: Exception | None = None
 
     @abstractmethod
     def start(self) -> None: ...
@@ -135,3 +152,33 @@ class Emulator(ABC):
 
     def __exit__(self, *_: object) -> None:
         self.stop()
+
+
+def run_until_signal(device: Emulator) -> None:
+    """Run a device until SIGTERM or Ctrl-C, or until it fails, whose error is raised. Use it in the main thread only.
+
+    What listens, and where, is printed after ``ready``.
+    """
+    told: list[bool] = []
+    handlers = {end: signal.signal(end, lambda *_: told.append(True)) for end in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        with device:
+            print(f"ready {device.place}", flush=True)  # at once, because a program may wait for it on a pipe
+            while not told:
+                if device.error is not None:
+                    raise device.error
+                time.sleep(CHECK_S)
+    finally:
+        for end, handler in handlers.items():
+            signal.signal(end, handler)
+
+
+def require_time_scale(time_scale: float) -> None:
+    """Raise ``DeviceError`` unless an emulated arm can be this many times as fast as the real one."""
+    if not SLOWEST <= time_scale <= FASTEST:
+        raise DeviceError(f"`time_scale` {time_scale:g}: expected {SLOWEST:g} to {FASTEST:g} times the real arm's speed")
+
+
+def fault_lines(known: dict[str, Fault]) -> list[str]:
+    """Lines of text about an emulator's faults: default values and effects."""
+    return [f"{name + ('' if fault.allowed is None else f'={fault.default:g}'):22} {fault.effect}" for name, fault in known.items()]

@@ -13,7 +13,7 @@ from threading import Event, Lock, Thread
 import numpy as np
 
 from hardware.arms.magician_wire import Message, take_message
-from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Fault, Faults, Range
+from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Fault, Faults, Range, require_time_scale
 from hardware.emulators.magician_controller import START_JOINTS_DEG, EmulatedController
 from twin.errors import ErrorsAs, TwinError
 
@@ -62,6 +62,7 @@ class MagicianEmulator(Emulator):
         joints_deg: Sequence[float] = START_JOINTS_DEG,
         time_scale: float = 1.0,
     ) -> None:
+        require_time_scale(time_scale)
         self.faults = Faults(FAULTS, faults)
         self.arm = EmulatedController(self.faults, joints_deg=joints_deg, time_scale=time_scale)
         self.device = ""
@@ -99,6 +100,7 @@ class MagicianEmulator(Emulator):
                 raise TwinError(f"{self._link}: can't make the link ({error.strerror}); remove it or give another `link`") from error
         self._thread = Thread(target=self._serve, daemon=True, name="magician-emulator")
         self._thread.start()
+        self.place = f"magician {self._link or self.device}"
         self.faults.after("unplugged", self.unplug)
 
     def stop(self) -> None:

@@ -23,7 +23,7 @@ from hardware.arms.mg400_wire import (
     Mode,
     require_ports,
 )
-from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Fault, Faults, Range
+from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Fault, Faults, Range, require_time_scale
 from hardware.emulators.mg400_commands import Mg400Commands, parse_firmware
 from hardware.emulators.mg400_controller import START_JOINTS_DEG, Mg400Controller, PlanarFrame
 from hardware.emulators.mg400_grammar import RefusedError, Request, refuse_if, take_request
@@ -111,6 +111,7 @@ class Mg400Emulator(Emulator):
         with ErrorsAs(ValueError, lambda error: TwinError(str(error))):
             version = parse_firmware(OLD_FIRMWARE if lenient else firmware)
         require_ports(port_offset or 0)
+        require_time_scale(time_scale)
         self.host, self._port_offset = host, port_offset
         self.faults = Faults(FAULTS, faults)
         self.arm = Mg400Controller(self.faults, joints_deg=joints_deg, time_scale=time_scale)
@@ -144,6 +145,7 @@ class Mg400Emulator(Emulator):
                 self.stop()
                 raise cannot_listen("mg400", *at, error, option="`port_offset`") from error
             self.ports[port] = server.server_address[1]
+        self.place = " ".join(map(str, ("mg400", self.host, *self.ports.values())))
         self._started_s = time.monotonic()
         self.faults.after("emergency-stop", self.arm.press_emergency_stop)
         self.faults.after("die", self.kill)

@@ -24,8 +24,7 @@ from hardware.arms.kinematics import Violation
 from hardware.arms.motion import MotionTrack, Speeds
 from hardware.arms.ur.driver import DASHBOARD_PORT, EMERGENCY, IDLE, NORMAL, PAUSED, PLAYING, POWER_OFF, PROTECTIVE, RUNNING, STOPPED
 from hardware.arms.ur.kinematics import UrKinematics, pose_from_ur, pose_to_ur
-from hardware.emulators.faults import SECONDS, SHARE, Emulator, Fault, Faults
-from hardware.emulators.running import require_time_scale, run_until_signal
+from hardware.emulators.faults import SECONDS, SHARE, Emulator, Fault, Faults, require_time_scale
 from hardware.emulators.servers import PortServer
 from hardware.errors import cannot_listen
 
@@ -256,6 +255,7 @@ class UrEmulator(Emulator):
     def start(self) -> None:
         """Begin to listen; errors as for ``plug``."""
         self.plug()
+        self.place = f"ur {self.host}"
         Thread(target=self._run, daemon=True, name="ur-emulator").start()
         self.faults.after("unplugged", self.unplug)
         self.faults.after("emergency-stop", self.arm.press_emergency_stop)
@@ -357,8 +357,3 @@ class UrEmulator(Emulator):
 
 def _send(connection: socket.socket, kind: bytes, content: bytes) -> None:
     connection.sendall(struct.pack(">H", 3 + len(content)) + kind + content)
-
-
-def emulate_ur(*, host: str = "127.0.0.1", faults: tuple[str, ...] = (), time_scale: float = 1.0) -> None:
-    """Emulate a UR5 until it is ended; see ``UrEmulator``."""
-    run_until_signal(UrEmulator(host=host, faults=faults, time_scale=time_scale), lambda: f"ur {host}")

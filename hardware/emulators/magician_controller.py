@@ -4,7 +4,6 @@ import logging
 import math
 import struct
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from threading import RLock
 from typing import Any
@@ -53,7 +52,7 @@ ACTS: dict[int, tuple[str, ...]] = {
     Id.WAIT: ("<I",),
 }
 # Forms of the parameters of all commands whose number of bytes is known, also of those for parts that are not attached to the arm.
-NOT_ATTACHED = {Id.MOTOR: ("<6x",), Id.MOTOR_STEPS: ("<10x",), Id.COLOR: ("<3x",), Id.INFRARED: ("<2x",)}
+NOT_ATTACHED: dict[int, tuple[str, ...]] = {Id.MOTOR: ("<6x",), Id.MOTOR_STEPS: ("<10x",), Id.COLOR: ("<3x",), Id.INFRARED: ("<2x",)}
 FORMS: dict[int, tuple[str, ...]] = {**ACTS, **NOT_ATTACHED, **{id: (form,) for id, (form, _) in STORED.items()}}
 # Commands that report what the device is. Their replies are chosen for the emulator.
 DEVICE_SERIAL, DEVICE_NAME, DEVICE_VERSION, POSE_L = 0, 1, 2, 13
@@ -92,10 +91,10 @@ def numbers_in(message: Message) -> tuple[Any, ...] | None:
 class EmulatedController:
     """Executes the commands of the arm. Every method may be called from any thread."""
 
-    def __init__(self, faults: Faults, *, joints_deg: Sequence[float] = START_JOINTS_DEG, time_scale: float = 1.0) -> None:
+    def __init__(self, faults: Faults, *, time_scale: float = 1.0) -> None:
         self.faults, self._time_scale = faults, time_scale
         self.kinematics = MAGICIAN
-        self.track = MotionTrack(MAGICIAN, np.asarray(joints_deg, float))
+        self.track = MotionTrack(MAGICIAN, np.array(START_JOINTS_DEG))
         self.lock = RLock()
         self.alarms: set[int] = set()
         self._replies = dict(REPLIES)
@@ -105,15 +104,10 @@ class EmulatedController:
         self._begun, self._lost_at_s = False, np.inf
         self._issued = self._current = 0
 
-    def pose(self, time_s: float | None = None) -> np.ndarray:
-        with self.lock:
-            now_s = self.advance()
-            return self.track.pose(now_s if time_s is None else time_s)
-
     def answer(self, message: Message) -> Message:
         """Execute a command or queue it. The reply has the same id and ctrl."""
         with self.lock:
-            now_s, reply = self.advance(), b""
+            now_s, reply = self.update(), b""
             writes = message.is_write or message.is_queued  # with the write bit or, from some clients, without
             if numbers_in(message) is None if writes else message.id in ACTS:  # clients read anything, to find out what there is
                 return self.refuse(message)
@@ -124,7 +118,7 @@ class EmulatedController:
             elif len(self._queue) < QUEUE_N:  # otherwise the reply has no index, because the command was not accepted
                 self._issued += 1
                 self._queue.append((self._issued, message, now_s))
-                self.advance()
+                self.update()
                 reply = struct.pack("<Q", self._issued)
             return replace(message, params=reply)
 
@@ -137,9 +131,9 @@ class EmulatedController:
     def busy(self) -> bool:
         """Whether commands are in progress or queued."""
         with self.lock:
-            return bool(self._queue) or self.track.moving(self.advance())
+            return bool(self._queue) or self.track.moving(self.update())
 
-    def advance(self) -> float:
+    def update(self) -> float:
         """Execute the queue up to the present time, which is returned. A command that fails ends with an alarm and is not tried again."""
         now_s = time.monotonic()
         with self.lock:
@@ -213,7 +207,7 @@ class EmulatedController:
         elif message.id == Id.WAIT:
             return begins_s + numbers[0] / 1000.0
         elif message.id == Id.JOG:
-            self._jog(*numbers, begins_s)
+            self._jog(numbers[0], numbers[1], begins_s)
         return begins_s  # ResetPose needs no action: the emulated arm always knows its pose
 
     def _ptp(self, mode: int, numbers: np.ndarray, begins_s: float) -> float:

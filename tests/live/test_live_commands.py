@@ -25,7 +25,7 @@ from hardware.cameras.reader import DevicePicture, LiveSource
 from hardware.cameras.recorded import SessionSource
 from hardware.cameras.twin import preview_of
 from hardware.emulators.camera import CameraEmulator
-from hardware.emulators.faults import run_until_signal
+from hardware.emulators.faults import Emulator
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError
 from hardware.live.live import LiveSession, Shower, WatchPlan, watch
@@ -441,7 +441,7 @@ def test_an_emulator_that_fails_ends_with_its_error():
     device = nullcontext()
     device.place, device.error = "a device", DeviceError("the arm is gone")
     with pytest.raises(DeviceError, match="the arm is gone"):
-        run_until_signal(device)
+        Emulator.run(device)
 
 
 @pytest.mark.slow

@@ -373,10 +373,9 @@ def mg400(
     Example:
       twin emulate mg400
     """
-    from hardware.emulators.faults import run_until_signal
     from hardware.emulators.mg400 import FAULTS, Mg400Emulator
 
-    run_until_signal(call(Mg400Emulator, locals(), faults=faults_of(fault, FAULTS)))
+    call(Mg400Emulator, locals(), faults=faults_of(fault, FAULTS)).run()
 
 
 @emulate.command("magician")
@@ -395,10 +394,9 @@ def magician(
     Example:
       twin emulate magician --link /tmp/magician
     """
-    from hardware.emulators.faults import run_until_signal
     from hardware.emulators.magician import FAULTS, MagicianEmulator
 
-    run_until_signal(call(MagicianEmulator, locals(), faults=faults_of(fault, FAULTS)))
+    call(MagicianEmulator, locals(), faults=faults_of(fault, FAULTS)).run()
 
 
 @emulate.command("ros2")
@@ -418,10 +416,9 @@ def ros2_arm(
       twin emulate ros2 --namespace left
       twin servo --object can --arm ros2:twist,namespace=left --out out/servo
     """
-    from hardware.emulators.faults import run_until_signal
     from hardware.emulators.ros2 import FAULTS, Ros2Emulator
 
-    run_until_signal(call(Ros2Emulator, locals(), faults=faults_of(fault, FAULTS)))
+    call(Ros2Emulator, locals(), faults=faults_of(fault, FAULTS)).run()
 
 
 @emulate.command("ur")
@@ -442,10 +439,9 @@ def ur(
     Example:
       twin emulate ur
     """
-    from hardware.emulators.faults import run_until_signal
     from hardware.emulators.ur import FAULTS, UrEmulator
 
-    run_until_signal(call(UrEmulator, locals(), faults=faults_of(fault, FAULTS)))
+    call(UrEmulator, locals(), faults=faults_of(fault, FAULTS)).run()
 
 
 @emulate.command("camera")

@@ -80,7 +80,7 @@ def terminals():
 
 
 def commands():
-    from hardware.emulators.faults import run_until_signal
+    from hardware.emulators.faults import Emulator
     from hardware.live.doctor import examine_machine
     from twin.signals import signals_as_ctrl_c
 
@@ -92,7 +92,7 @@ def commands():
     threading.Timer(0.5, raise_signal, (SIGINT,)).start()
     device = nullcontext()
     device.place, device.error = "now", None
-    run_until_signal(device)
+    Emulator.run(device)
 
 
 def studio():

@@ -2,7 +2,7 @@
 
 ``collect_frames`` goes from a plan to labelled frames in a folder, and continues an interrupted collection. The arm starts ``CLEAR_MM``
 from the object and lifts off by ``LIFT_MM`` between two contacts. Between two lifted poses it moves around the object on a path of
-``hardware.rig.approach``; in front of an infinite object it moves straight. A frame counts only if it was exposed after the arm reported
+``hardware.rig.geometry``; in front of an infinite object it moves straight. A frame counts only if it was exposed after the arm reported
 that it stands at the commanded pose. The table holds the reported pose.
 """
 

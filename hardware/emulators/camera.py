@@ -61,7 +61,6 @@ class CameraEmulator(Emulator):
         self.faults = Faults(FAULTS, faults)
         self._source, self._address = source, (host, port)
         self._running: tuple[_Server, threading.Thread] | None = None
-        self.error: Exception | None = None
         self.made = 0
 
     @property
@@ -83,6 +82,7 @@ class CameraEmulator(Emulator):
         self._running = server, threading.Thread(target=self._make, args=(server,), name="camera emulator", daemon=True)
         server.start()
         self._running[1].start()
+        self.place = f"camera {self.url}"
 
     def stop(self) -> None:
         if self._running is not None:

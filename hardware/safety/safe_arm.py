@@ -16,7 +16,7 @@ import numpy as np
 from hardware.arms.arm import FEEDBACK_AGE_S, Arm, ArmState
 from hardware.arms.kinematics import Kinematics
 from hardware.errors import Connection, DeviceError, StaleDataError, also
-from hardware.rig.last_axis import LastAxis
+from hardware.rig.geometry import LastAxis
 from hardware.safety.decide import Action, Decision, DecisionCode, SafetyLimits, Sensed, clip, decide, decide_joints
 
 # Number of newest decisions that are kept in memory.

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 from hardware.arms.open_arm import kind_of, open_arm
 from hardware.cameras.mjpeg import without_secrets
 from hardware.errors import DeviceError, in_short
-from hardware.rig.geometry import PlacedObject, shift_in_tool
-from hardware.rig.last_axis import LastAxis, poses_along, turns_back_mm
+from hardware.rig.geometry import LastAxis, PlacedObject, poses_along, shift_in_tool, turns_back_mm
 from hardware.servo.loop import ServoLoop, require_labels
 from hardware.servo.step import LoopHooks, LoopSettings, StepRecord
 from hardware.servo.timing import Timing

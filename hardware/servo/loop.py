@@ -14,7 +14,7 @@ import numpy as np
 from hardware.arms.arm import ArmState
 from hardware.cameras.source import no_frame
 from hardware.errors import DeviceError, StaleDataError
-from hardware.rig.last_axis import HOLD_DEG
+from hardware.rig.geometry import HOLD_DEG
 from hardware.safety.decide import DecisionCode, Sensed
 from hardware.safety.eyes import NEAR_MM as PIECES_MM
 from hardware.safety.eyes import BlindError, pieces_to

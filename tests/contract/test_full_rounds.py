@@ -10,8 +10,7 @@ from true_estimator import TrueEstimator
 
 from hardware.arms.kinematics import MG400
 from hardware.emulators.mg400 import Mg400Emulator
-from hardware.rig.geometry import PlacedObject
-from hardware.rig.last_axis import HOLD_DEG, LastAxis, turns_back_mm
+from hardware.rig.geometry import HOLD_DEG, LastAxis, PlacedObject, turns_back_mm
 from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import SafeArm
 from hardware.servo.following import steps_round

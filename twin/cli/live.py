@@ -344,7 +344,7 @@ TimeScale = Annotated[float, typer.Option("--time-scale", help="speed relative t
 
 def faults_of(wanted: list[str] | None, known: dict[str, "Fault"]) -> tuple[str, ...]:
     """The faults that the user asks for. If the user asks for help, the known faults are printed and the command ends."""
-    from hardware.emulators.running import fault_lines
+    from hardware.emulators.faults import fault_lines
 
     if wanted and "help" in wanted:
         print_lines(fault_lines(known))
@@ -373,10 +373,9 @@ def mg400(
     Example:
       twin emulate mg400
     """
-    from hardware.emulators.mg400 import FAULTS
-    from hardware.emulators.running import emulate_mg400
+    from hardware.emulators.mg400 import FAULTS, Mg400Emulator
 
-    call(emulate_mg400, locals(), faults=faults_of(fault, FAULTS))
+    call(Mg400Emulator, locals(), faults=faults_of(fault, FAULTS)).run()
 
 
 @emulate.command("magician")
@@ -395,10 +394,9 @@ def magician(
     Example:
       twin emulate magician --link /tmp/magician
     """
-    from hardware.emulators.magician import FAULTS
-    from hardware.emulators.running import emulate_magician
+    from hardware.emulators.magician import FAULTS, MagicianEmulator
 
-    call(emulate_magician, locals(), faults=faults_of(fault, FAULTS))
+    call(MagicianEmulator, locals(), faults=faults_of(fault, FAULTS)).run()
 
 
 @emulate.command("ros2")
@@ -418,9 +416,9 @@ def ros2_arm(
       twin emulate ros2 --namespace left
       twin servo --object can --arm ros2:twist,namespace=left --out out/servo
     """
-    from hardware.emulators.ros2 import FAULTS, emulate_ros2
+    from hardware.emulators.ros2 import FAULTS, Ros2Emulator
 
-    call(emulate_ros2, locals(), faults=faults_of(fault, FAULTS))
+    call(Ros2Emulator, locals(), faults=faults_of(fault, FAULTS)).run()
 
 
 @emulate.command("ur")
@@ -441,9 +439,9 @@ def ur(
     Example:
       twin emulate ur
     """
-    from hardware.emulators.ur import FAULTS, emulate_ur
+    from hardware.emulators.ur import FAULTS, UrEmulator
 
-    call(emulate_ur, locals(), faults=faults_of(fault, FAULTS))
+    call(UrEmulator, locals(), faults=faults_of(fault, FAULTS)).run()
 
 
 @emulate.command("camera")

@@ -80,7 +80,7 @@ def terminals():
 
 
 def commands():
-    from hardware.emulators.running import run_until_signal
+    from hardware.emulators.faults import Emulator
     from hardware.live.doctor import examine_machine
     from twin.signals import signals_as_ctrl_c
 
@@ -90,7 +90,9 @@ def commands():
     from signal import SIGINT, raise_signal
 
     threading.Timer(0.5, raise_signal, (SIGINT,)).start()
-    run_until_signal(nullcontext(), lambda: "now")
+    device = nullcontext()
+    device.place, device.error = "now", None
+    Emulator.run(device)
 
 
 def studio():

@@ -17,8 +17,7 @@ from hardware.cameras.mjpeg import without_secrets
 from hardware.errors import DeviceError, in_short
 from hardware.rig.geometry import PlacedObject, shift_in_tool
 from hardware.rig.last_axis import LastAxis, poses_along, turns_back_mm
-from hardware.servo.loop import ServoLoop, require_labels
-from hardware.servo.step import LoopHooks, LoopSettings, StepRecord
+from hardware.servo.loop import LoopHooks, LoopSettings, ServoLoop, StepRecord, require_labels
 from hardware.servo.timing import Timing
 from hardware.servo.trajectory import Measures, Trajectory, comparison_figure, measure, trajectory_figure, trajectory_of, write_csv
 from hardware.workcell.build import TWIN, DryRunDone, Rig, build_rig, check_plan, load_rest_frame
@@ -27,7 +26,7 @@ from scenes.files import quote
 from twin.errors import OptionError, StoreError, TwinError, format_count
 from twin.estimate import Estimate, SensorModel
 from twin.policy import KnownContacts, Policy, PolicyError, PolicyModel, load_policy
-from twin.progress import Progress, Step, silent, stage
+from twin.progress import Progress, silent, stage
 from twin.records import KeptAlso
 from twin.records.session import SessionWriter, plain
 from twin.report.charts import write_chart
@@ -246,7 +245,8 @@ def follow(
     steps = plan.steps or round_steps
     if plan.steps:
         wanted_mm = min(wanted_mm, plan.steps * plan.servo.feed_mm)
-    entries = _result_entries(plan, model) | (about or {})
+    entries = {"sensor": model.sensor.name, "object": plan.obj.name, "camera": without_secrets(plan.camera), "arm": plan.arm}
+    entries |= {"servo": plan.servo.model_dump()} | (about or {})
     failure, followed = "", None
     with rig, stage(progress, f"following the {plan.obj.name}") as step, ExitStack() as stack:
         takes_rest = plan.at_rest == FIRST and model.counts_from_rest and rig.source.is_live
@@ -261,9 +261,20 @@ def follow(
         session = stack.enter_context(SessionWriter(out / SESSION, entries)) if plan.record else None
         if session is not None and rest is not None:
             session.keep_rest(rest)
-        take_rest = partial(_take_rest, session, model) if takes_rest else None
+
+        def take_rest(frame: Frame) -> SensorModel:
+            """Store the frame that was taken clear of the object, and use its pins as the pins at rest."""
+            if session is not None:
+                session.keep_rest(frame)
+            return model.at_rest(frame)
+
+        def note_step(record: StepRecord, frame: Frame, estimate: Estimate) -> None:
+            if session is not None:
+                session.append(frame, asdict(record))
+            step(record.index + 1, steps)
+
         publish = stack.enter_context(rig.publishing(plan.ros2, model.pipeline))
-        hooks = LoopHooks(law, take_rest, partial(_note_step, session, step, steps), publish)
+        hooks = LoopHooks(law, take_rest if takes_rest else None, note_step, publish)
         period_s = 1.0 / (plan.stream_hz or STREAM_HZ)
         settings = LoopSettings(steps, plan.stream_hz is None, period_s, rig.frame_timeout_s, GIVE_UP_S)
         loop = ServoLoop(rig, plan.servo, model, settings, hooks)
@@ -298,12 +309,6 @@ def steps_round(placed: PlacedObject, servo: ServoSpec, rounds: float) -> tuple[
     return int(np.ceil(way_mm / servo.feed_mm)), rounds * length_mm
 
 
-def _result_entries(plan: FollowPlan, model: SensorModel) -> dict[str, Any]:
-    """The entries that are stored with the results."""
-    names = {"sensor": model.sensor.name, "object": plan.obj.name, "camera": without_secrets(plan.camera), "arm": plan.arm}
-    return names | {"servo": plan.servo.model_dump()}
-
-
 def _say_plan(plan: FollowPlan, rig: Rig, model: SensorModel, wanted_mm: float, steps: int, takes_rest: bool) -> None:
     """Check the plan and report it. Of the outline every ``CHECK_MM`` is checked."""
     planned = [pose for distance, pose in poses_along(rig.placed, plan.servo.indent_mm, wanted_mm)]
@@ -324,19 +329,6 @@ def _say_turns(rig: Rig, servo: ServoSpec, wanted_mm: float) -> None:
     axis = LastAxis(getattr(rig.arm, "kinematics", None), rig.mounting.centre_mm)
     for distance_mm in turns_back_mm(rig.placed, axis, servo.indent_mm, wanted_mm):
         LOG.warning("%s: its last axis will turn back by a full turn after about %.0f mm, clear of the object", rig.arm.name, distance_mm)
-
-
-def _note_step(session: SessionWriter | None, step: Step, steps: int, record: StepRecord, frame: Frame, estimate: Estimate) -> None:
-    if session is not None:
-        session.append(frame, asdict(record))
-    step(record.index + 1, steps)
-
-
-def _take_rest(session: SessionWriter | None, model: SensorModel, frame: Frame) -> SensorModel:
-    """Store the frame that was taken clear of the object, and use its pins as the pins at rest."""
-    if session is not None:
-        session.keep_rest(frame)
-    return model.at_rest(frame)
 
 
 def _results(plan: FollowPlan, rig: Rig, loop: ServoLoop, wanted_mm: float, failure: str) -> Followed:

@@ -253,7 +253,7 @@ class Ros2Publisher:
         if all(name in known for name in _FORCES):
             force_n = np.array([known[name] for name in _FORCES])
             self._send("wrench", at_ns, lambda: {"header": header, "wrench": ros.wrench(force_n, np.full(3, np.nan))})
-            self._send("contact", at_ns, lambda: {"data": bool(np.linalg.norm(force_n) > ros.TOUCHES_N)})
+            self._send("contact", at_ns, lambda: {"data": int(np.linalg.norm(force_n) > ros.TOUCHES_N)})
         if slip := [name for name in names if name.startswith("slip_")]:
             self._send("slip", at_ns, lambda: ros.number_array(np.array([known[name] for name in slip]), ",".join(slip)))
 

@@ -15,8 +15,7 @@ from hardware.rig.last_axis import HOLD_DEG, LastAxis, turns_back_mm
 from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import SafeArm
 from hardware.servo.following import steps_round
-from hardware.servo.loop import ServoLoop
-from hardware.servo.step import LoopSettings
+from hardware.servo.loop import LoopSettings, ServoLoop
 from hardware.workcell.build import Rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.rig.mounting import Mounting

@@ -7,7 +7,6 @@ Recordings of any origin, collections, and simulated data sets with their truth 
 import csv
 import json
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -58,11 +57,11 @@ def recording_records(path: Path, form: Form | None = None) -> Records:
     """
     if path.is_dir() and (path / TRUTH).is_dir() and not any((path / name).is_dir() for name in ("images", "frames_bw")):
         raise RecordError(f"{path}: holds pins without pictures; make the data set with `images` raw, gray or processed")
-    own = format_of(path) == RecordingWriter.FORMAT if path.is_dir() else False
-    if own and not (path / EPISODES).is_file():
-        return Records(read_sidecar(path)[0], [])
+    stated = read_sidecar(path)[0] if path.is_dir() and format_of(path) == RecordingWriter.FORMAT else None
+    if stated is not None and not (path / EPISODES).is_file():
+        return Records(stated, [])
     recording = open_recording(path, None, form)
-    values, estimates = _table_values(recording, read_sidecar(path)[0].names if own else {})
+    values, estimates = _table_values(recording, {} if stated is None else stated.names)
     notes = list(recording.problems)
     _take_out_moves(path, recording, values, notes)
     values |= _read_pins(path, recording) | _read_truth(path, recording) | _read_requested_poses(path, recording)
@@ -71,32 +70,30 @@ def recording_records(path: Path, form: Form | None = None) -> Records:
     if found is None:
         raise RecordError(f"{path}: no frame can be read; {AGAIN}")
     described = _read_description(path)
-    about = About(
+    about = stated or About(
         sensor=str(described.get("sensor", "")),
         form=recording.form,
         size_px=recording.size_px,
         gray=found.image.ndim == 2,
-        numbers={name: int(np.prod(values[name].shape[1:])) for name in CHANNELS if name in values},
+        numbers={name: int(np.prod(array.shape[1:])) for name, array in values.items()},
         estimates=estimates,
         robot=str(described.get("arm", "")),
     )
-    if own:
-        about = read_sidecar(path)[0]
-        if missing := set(about.numbers) - set(values):
-            raise RecordError(f"{path}: {PINS if missing == {'pins'} else TABLE} is missing, or lacks columns; {AGAIN}")
+    if missing := set(about.numbers) - set(values):
+        raise RecordError(f"{path}: {PINS if missing == {'pins'} else TABLE} is missing, or lacks columns; {AGAIN}")
     carried = {column for name in values for column in columns_of(CHANNELS[name], about.axes(name))} | NOT_CARRIED
     left = [name for name, cells in recording.labels.items() if name not in carried and cells.dtype.kind == "f"]
     notes += [f"columns {', '.join(left)} are not copied into the record"] if left else []
     records = Records(about, [], notes)
     rest = None if recording.reference is None else recording.reference.image
-    facts = read_facts(path / EPISODES) if own else []
+    facts = [] if stated is None else read_facts(path / EPISODES)
     for number, rows in enumerate(_paths(recording)):
         times_s = _times(recording, rows, notes)
         steps = partial(_steps_of, recording, values, rows, times_s, notes)
-        if own:
+        if stated is not None:
             if number == len(facts):  # the rest was unfinished when a run was killed
                 break
-            records.episodes.append(replace(episode_of(path, facts[number] | {"rest": None}, steps), rest=rest))
+            records.episodes.append(episode_of(path, facts[number], steps, rest))
             continue
         labels = {name: array[rows[0]].tolist() for name, array in values.items() if name in ("pose", "move")}
         key = f"{path.name}/{recording.names[rows[0]]}#{digest(labels, len(rows))}"

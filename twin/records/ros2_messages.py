@@ -1,18 +1,18 @@
 """ROS 2 messages, defined once: for the MCAP records, for live topics (``hardware.ros2``), and for reading both.
 
-A message is a dict of its fields; fields that are missing are 0, "" or empty. ``encode`` and ``decode`` translate to and from CDR (XCDR1,
-the encoding of ROS 2): each number is aligned to its size, a text or a sequence follows its length.
+A message is a dict of its fields; fields that are missing are 0, "" or empty. The package ``rosbags`` knows the fields of ROS 2's messages
+(Humble and later), and translates to and from CDR (XCDR1, the encoding of ROS 2).
 """
 
-import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from functools import cache
-from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from twin.errors import ErrorsAs, library
 from twin.records.record import POSE_AXES
 
 MM_PER_M = 1000.0
@@ -20,17 +20,6 @@ NS_PER_S = 1_000_000_000
 TF_TOPIC, TF_STATIC_TOPIC, DIAGNOSTICS_TOPIC = "/tf", "/tf_static", "/diagnostics"
 TOUCHES_N = 1e-6
 """Force, N, above which the topic ``contact`` is 1."""
-DEFINITIONS = dict(re.findall(r"^MSG: (\S+)\n((?:.* .*\n)*)", Path(__file__).with_name("ros2.msg").read_text("utf-8"), re.MULTILINE))
-"""Fields of each message, as in ROS 2 (Humble and later), by the message's short name."""
-_DTYPES = {name: np.dtype(name) for name in ("float32", "float64", "int8", "int32", "uint8", "uint32")}
-_DTYPES |= {"bool": np.dtype("?"), "byte": np.dtype("uint8")}
-_ENCAPSULATION: dict[bytes, Literal["<", ">"]] = {
-    b"\x00\x01": "<",
-    b"\x00\x00": ">",
-}  # the first two of the four bytes before a message: little or big endian
-
-
-_TEXT = "std_msgs/String"  # each text of an array is written as this message
 
 
 class Field(NamedTuple):
@@ -45,10 +34,19 @@ class Field(NamedTuple):
 
 
 @cache
+def _store() -> Any:
+    typesys = library("rosbags.typesys")
+    return typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+
+
+@cache
 def fields_of(kind: str) -> tuple[Field, ...]:
     """The fields of a message, by its short name (``sensor_msgs/Image``)."""
-    found = re.findall(r"^(\S+?)(\[(\d*)\])? (\w+)$", DEFINITIONS[kind], re.MULTILINE)
-    return tuple(Field(name, base, int(count or 0) if array else None) for base, array, count, name in found)
+    found = []
+    for name, (node, detail) in _store().fielddefs[full_name(kind)][1]:
+        one, length = (detail[0][1], detail[1]) if node.name in ("ARRAY", "SEQUENCE") else (detail, None)
+        found.append(Field(name, (one if isinstance(one, str) else one[0]).replace("/msg/", "/"), length))
+    return tuple(found)
 
 
 def full_name(kind: str) -> str:
@@ -56,109 +54,54 @@ def full_name(kind: str) -> str:
     return kind.replace("/", "/msg/")
 
 
-@cache
 def definition_of(kind: str) -> str:
     """The definition of a message and of all messages in it, as MCAP files contain it."""
-    needed = [kind]
-    for each in needed:
-        needed += [field.kind for field in fields_of(each) if field.kind in DEFINITIONS and field.kind not in needed]
-    return DEFINITIONS[kind] + "".join(f"{'=' * 80}\nMSG: {each}\n{DEFINITIONS[each]}" for each in dict.fromkeys(needed[1:]))
-
-
-@cache
-def _one_dtype(kind: str) -> np.dtype | None:
-    """The type of the numbers of a message that contains nothing else, such as a point; None for any other."""
-    kinds = {field.kind if field.length is None else "" for field in fields_of(kind)}
-    return _DTYPES.get(kinds.pop()) if len(kinds) == 1 else None
+    return str(_store().generate_msgdef(full_name(kind), ros_version=2)[0])
 
 
 def encode(kind: str, message: Mapping[str, Any]) -> bytes:
     """A message in CDR. Arrays of numbers, and of messages that consist of equal numbers (points), may be NumPy arrays."""
-    out = bytearray(b"\x00\x01\x00\x00")
-    _write(out, kind, message)
-    return bytes(out)
+    return bytes(_store().serialize_cdr(_whole(kind, message), full_name(kind)))
 
 
-def _align(out: bytearray, size: int) -> None:
-    out += bytes((4 - len(out)) % size)  # counted from the end of the four bytes at the start
-
-
-def _write(out: bytearray, kind: str, message: Mapping[str, Any]) -> None:
+def _whole(kind: str, message: Mapping[str, Any] | np.ndarray) -> Any:
+    """A message as an object of ``rosbags``, with all fields."""
+    values: dict[str, Any] = {}
+    if isinstance(message, np.ndarray):
+        message = dict(zip((field.name for field in fields_of(kind)), message.tolist(), strict=True))
     for name, base, length in fields_of(kind):
-        value: Any = message.get(name)
-        if text := base == "string" and length is None:
-            value = (value or "").encode() + b"\0"
-        elif length == 0 and value is None:
-            value = ()
-        if length == 0 or text:
-            _align(out, 4)
-            out += len(value).to_bytes(4, "little")
-        if isinstance(value, bytes):
-            out += value
-        elif base in DEFINITIONS and length is None:
-            _write(out, base, value or {})
+        value = message.get(name)
+        if "/" in base:
+            value = _whole(base, value or {}) if length is None else [_whole(base, each) for each in (() if value is None else value)]
         elif base == "string":
-            for each in value:
-                _write(out, _TEXT, {"data": each})
-        elif base in DEFINITIONS and not isinstance(value, np.ndarray):
-            for each in value:
-                _write(out, base, each)
+            value = value or ("" if length is None else [])
+        elif length is None:
+            value = 0 if value is None else value
+        elif isinstance(value, bytes):
+            value = np.frombuffer(value, np.uint8)
         else:
-            numbers = np.asarray(np.zeros(length or 1) if value is None else value, _DTYPES.get(base) or _one_dtype(base))
-            if numbers.size:
-                _align(out, numbers.itemsize)
-                out += numbers.tobytes()
+            value = np.asarray(np.zeros(length) if value is None else value, {"byte": "uint8"}.get(base, base))
+        values[name] = value
+    return _store().types[full_name(kind)](**values)
 
 
 def decode(kind: str, data: bytes) -> dict[str, Any]:
-    """A message from CDR. Arrays of numbers come as NumPy arrays.
+    """A message from CDR, as a dict. Arrays of numbers come as NumPy arrays.
 
     Raises
     ------
     ValueError
         The bytes are no message of this kind.
     """
-    order = _ENCAPSULATION.get(bytes(data[:2]))
-    if order is None:
+    if bytes(data[:2]) not in (b"\x00\x00", b"\x00\x01"):
         raise ValueError(f"{full_name(kind)}: an encoding other than CDR")
-    try:
-        message, end = _read(memoryview(data)[4:], 0, kind, order)
-        if end > len(data) - 4:
-            raise ValueError(f"{len(data)} bytes of {end + 4}")
-        return message
-    except (IndexError, TypeError, UnicodeDecodeError, ValueError) as error:
-        raise ValueError(f"{full_name(kind)}: cut or damaged ({error})") from error
+    # the library raises exceptions of several types for damaged bytes
+    with ErrorsAs(Exception, lambda error: ValueError(f"{full_name(kind)}: cut or damaged ({error})")):
+        return asdict(_store().deserialize_cdr(data, full_name(kind)), dict_factory=_without_type)
 
 
-def _read(data: memoryview, at: int, kind: str, order: Literal["<", ">"]) -> tuple[dict[str, Any], int]:
-    """A message that begins at a place, and where it ends."""
-
-    def numbers(dtype: np.dtype, count: int) -> np.ndarray:
-        nonlocal at
-        if not count:
-            return np.empty(0, dtype)
-        at += -at % dtype.itemsize
-        found = np.frombuffer(data, dtype.newbyteorder(order), count, at)
-        at += found.nbytes
-        return found
-
-    message: dict[str, Any] = {}
-    for name, base, length in fields_of(kind):
-        text = base == "string" and length is None
-        count = int(numbers(_DTYPES["uint32"], 1)[0]) if length == 0 or text else length
-        if text:
-            message[name], at = bytes(data[at : at + int(count or 1) - 1]).decode(), at + int(count or 0)
-        elif base in _DTYPES:
-            found = numbers(_DTYPES[base], 1 if count is None else count)
-            message[name] = found if count is not None else found[0].item()
-        elif count is None:
-            message[name], at = _read(data, at, base, order)
-        else:
-            message[name] = []
-            for _ in range(count):
-                each, at = _read(data, at, _TEXT if base == "string" else base, order)
-                message[name].append(each["data"] if base == "string" else each)
-    return message, at
+def _without_type(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    return {name: value for name, value in pairs if name != "__msgtype__"}
 
 
 def header_of(at_ns: int, frame: str) -> dict[str, Any]:

@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 
-from hardware.cameras.coded import decode_picture, on_own_clock
+from hardware.cameras.mjpeg import decode_picture, on_own_clock
 from hardware.cameras.reader import DevicePicture, LiveSource, ReadFailed, TornPicture
 from hardware.errors import DeviceError
 from hardware.ros2.dds import Participant, Reader, domain_id

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hardware.cameras.picture_page import PicturePage
+from hardware.cameras.mjpeg import PicturePage
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
 from twin.frames.forms import gray_levels

@@ -9,7 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from socket import create_connection
@@ -240,7 +240,7 @@ def same_estimates(steps: list[dict], values: list[np.ndarray]) -> int:
     return same
 
 
-class Shower:
+class Shower(AbstractContextManager["Shower"]):
     """Shows the newest frame from its own thread, so that drawing does not delay the session. A context manager.
 
     Parameters
@@ -258,7 +258,7 @@ class Shower:
 
     def __init__(self, session: LiveSession, pipeline: Pipeline, view: View) -> None:
         self._session, self._pipeline, self._view = session, pipeline, view
-        self._opened, self._end = threading.Event(), threading.Event()
+        self._end = threading.Event()
         self._thread = threading.Thread(target=self._run, name="view", daemon=True)
         self._error: Exception | None = None
 
@@ -268,47 +268,39 @@ class Shower:
         return not self._end.is_set()
 
     def __enter__(self) -> "Shower":
+        self._view.__enter__()
         self._thread.start()
-        self._opened.wait()
-        self._raise_error()
         return self
 
     def __exit__(self, kind: type | None, *_: object) -> None:
         self._end.set()
         self._thread.join(timeout=CLOSE_S)
-        if kind is None:
-            self._raise_error()
-
-    def _raise_error(self) -> None:
-        """Raise the error with which the view ended, if there is one."""
-        if isinstance(self._error, TwinError):
+        if kind is None and self._error is not None:
             raise self._error
-        if self._error is not None:
-            raise DeviceError(f"the view failed ({self._error}); without `rerun`, `headless` shows nothing") from self._error
 
     def _run(self) -> None:
         try:
-            self._show()
-        except Exception as error:
+            with ExitStack() as stack:
+                stack.push(self._view)
+                self._show()
+        except TwinError as error:
             self._error = error
-            self._end.set()
-        finally:
-            self._opened.set()
+        except Exception as error:
+            self._error = DeviceError(f"the view failed ({error}); without `rerun`, `headless` shows nothing")
+        self._end.set()
 
     def _show(self) -> None:
         shown = None
-        with self._view as view:
-            self._opened.set()
-            while not self._end.wait(SHOW_S):
-                newest = self._session.newest
-                if newest is None or newest is shown:
-                    continue
-                try:
-                    lines = self._session.lines(newest[1])
-                except RuntimeError:  # the session added a time while the times were read
-                    continue
-                shown = newest
-                view.show(LiveFrame(*newest, tuple(lines[1:])), pins_in(*newest, self._pipeline))
+        while not self._end.wait(SHOW_S):
+            newest = self._session.newest
+            if newest is None or newest is shown:
+                continue
+            try:
+                lines = self._session.lines(newest[1])
+            except RuntimeError:  # the session added a time while the times were read
+                continue
+            shown = newest
+            self._view.show(LiveFrame(*newest, tuple(lines[1:])), pins_in(*newest, self._pipeline))
 
 
 @dataclass(frozen=True)

@@ -227,13 +227,12 @@ def run_gripper(
     with ExitStack() as stack:
         stack.enter_context(rig.connect())
         about = {"arm": rig.arm.name, "gripper": rig.gripper.name, "sensors": list(rig.sources)}
+        watch, eyes = ArmWatch(rig.arm), FreshFrames(rig.arm, cast(FrameSource, _AllSources(rig.sources)))
         records = {}
         for name, source in rig.sources.items():
             if out is not None:
                 entries = about | {"sensor": pipelines[name].spec.name, "camera": source.name}
                 records[name] = stack.enter_context(SessionWriter(out / name, entries))
-        watch, eyes = ArmWatch(rig.arm), FreshFrames(rig.arm, cast(FrameSource, _AllSources(rig.sources)))
-        for name, source in rig.sources.items():
             of = ros2 and f"{ros2}/{name}"
             stack.enter_context(publishing(of, source, pipelines[name], estimates=False, arm=lambda: watch.newest))
         stack.enter_context(watch.alert())

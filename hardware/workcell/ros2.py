@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from hardware.arms.arm import ArmState
-from hardware.cameras.coded import jpeg_of
+from hardware.cameras.mjpeg import jpeg_of
 from hardware.cameras.reader import LiveSource
 from hardware.cameras.source import FrameSource
 from hardware.ros2.dds import Participant, Writer

@@ -22,7 +22,7 @@ from drawn_frames import drawn_frame
 from hypothesis import HealthCheck, given, settings
 
 from hardware.cameras.choose import open_camera
-from hardware.cameras.coded import jpeg_of
+from hardware.cameras.mjpeg import jpeg_of
 from hardware.cameras.reader import LiveSource, ReadFailed
 from hardware.cameras.ros2 import Ros2Camera
 from hardware.errors import DeviceError

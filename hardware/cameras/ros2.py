@@ -11,7 +11,7 @@ from hardware.ros2.dds import Participant, Reader, domain_id
 from scenes.files import quote
 from scenes.sensor import SensorSpec
 from twin.errors import ErrorsAs
-from twin.records.ros2_messages import NS_PER_S, decode
+from twin.records.ros2 import NS_PER_S, decode
 from twin.types import Form
 
 PICTURES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage")

@@ -108,7 +108,12 @@ class Collection:
         self.pictures.mkdir(exist_ok=True)
         for lines in (table, self.folder / LOG):
             if lines.is_file():
-                self._drop_torn_line(lines)
+                try:
+                    text = lines.read_text(encoding="utf-8")
+                except ValueError as error:
+                    raise DeviceError(f"{lines}: is damaged ({quote(error)}); give another `out`") from error
+                if not text.endswith("\n"):  # the last line is torn
+                    write_text(lines, text[: text.rfind("\n") + 1])
         if not table.is_file() or not table.read_text(encoding="utf-8"):
             write_text(table, ",".join(COLUMNS) + "\n")
 
@@ -154,13 +159,6 @@ class Collection:
             csv.writer(file, lineterminator="\n").writerow(row)
             file.flush()
             os.fsync(file.fileno())
-
-    @staticmethod
-    def _drop_torn_line(lines: Path) -> None:
-        with ErrorsAs(ValueError, lambda error: DeviceError(f"{lines}: is damaged ({quote(error)}); give another `out`")):
-            text = lines.read_text(encoding="utf-8")
-        if not text.endswith("\n"):
-            write_text(lines, text[: text.rfind("\n") + 1])
 
 
 def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str = "random") -> PlannedContact:

@@ -14,7 +14,7 @@ from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Fault
 from hardware.emulators.running import run_until_signal
 from hardware.errors import DeviceError
 from hardware.ros2.dds import Participant, Reader, Writer, domain_id
-from twin.records import ros2_messages as ros
+from twin.records import ros2 as ros
 from twin.rig.arm_pose import matrix_of, pose_of
 
 PERIOD_S = 0.01

@@ -40,7 +40,7 @@ from twin.errors import ErrorsAs, OptionError
 from twin.pins import Pipeline
 from twin.progress import Progress, silent, stage
 from twin.records import ALSO, KeptAlso
-from twin.records import ros2_messages as ros
+from twin.records import ros2 as ros
 from twin.records.session import SessionWriter
 from twin.store import writes
 from twin.types import Form, Frame, Observation

@@ -27,7 +27,7 @@ from twin.estimate import Estimate, pins_in, readable_labels
 from twin.frames.forms import recording_to_raw
 from twin.geometry.pins import rest_pins
 from twin.pins import Pipeline
-from twin.records import ros2_messages as ros
+from twin.records import ros2 as ros
 from twin.rig.arm_pose import matrix_of
 from twin.types import Form, Frame
 

@@ -36,7 +36,7 @@ from twin.contracts import CameraContract
 from twin.errors import OptionError
 from twin.geometry.pins import rest_pins
 from twin.pins import Pipeline
-from twin.records.ros2_messages import decode, encode, full_name
+from twin.records.ros2 import decode, encode, full_name
 from twin.types import Form, Frame
 
 ROS = get_typestore(Stores.ROS2_HUMBLE)

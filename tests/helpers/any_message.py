@@ -4,7 +4,7 @@ from functools import cache
 
 from hypothesis import strategies as st
 
-from twin.records.ros2_messages import fields_of
+from twin.records.ros2 import fields_of
 
 KINDS = (
     "builtin_interfaces/Duration",

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 from rosbags.typesys import Stores, get_typestore
 
-from twin.records.ros2_messages import decode, definition_of, encode, fields_of, full_name
+from twin.records.ros2 import decode, definition_of, encode, fields_of, full_name
 
 ROS = get_typestore(Stores.ROS2_HUMBLE)
 

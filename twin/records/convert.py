@@ -1,7 +1,7 @@
 """Translates records from any format into any other, and keeps a record in further formats while it is being made."""
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -87,10 +87,8 @@ def with_pins(records: Records, spec: SensorSpec | None = None) -> Records:
             _require_pins_of(spec, records.about)
         return records
     if spec is None:
-        try:
+        with suppress(SpecError):
             spec = load_sensor(records.about.sensor) if records.about.sensor else None
-        except SpecError:
-            spec = None
     if spec is None:
         note = "no pins: the record does not name a known sensor; give `sensor`, so that its pins are detected"
         return replace(records, notes=[*records.notes, note])

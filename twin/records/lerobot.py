@@ -9,7 +9,7 @@ frame. In addition to LeRobot's columns, the table of episodes has ``tactip/fact
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial, reduce
 from itertools import chain
 from pathlib import Path
@@ -127,7 +127,10 @@ class LeRobotWriter(FolderWriter):
         parquet, pa = library("pyarrow.parquet"), library("pyarrow")
         schema = self._schema(pa)
         frames, written = self._frames, 0
-        opened = [_open_film(path, self.rate_hz, self.about.size_px) for path in films.values()]
+        codec = cv2.VideoWriter.fourcc(*FOURCC)
+        opened = [cv2.VideoWriter(str(path), codec, float(self.rate_hz), self.about.size_px) for path in films.values()]
+        if not all(film.isOpened() for film in opened):
+            raise RecordError(f"this OpenCV can't write {FOURCC} videos; leave out `video`")
         with parquet.ParquetWriter(file, schema, compression="snappy", write_page_checksum=True) as table:
             for episode in waiting:
                 number, rows, length = len(self.facts) + len(group), [], 0
@@ -262,17 +265,16 @@ class _Gathered:
     """Data from which an episode's statistics are computed."""
 
     def __init__(self, about: About) -> None:
-        self._values: dict[str, list[np.ndarray]] = {name: [] for name in about.numbers}
+        self._about = about
         self.times_s: list[float] = []
-        self._images = [image_column(view) for view in about.views]
+        self._values: list[Mapping[str, np.ndarray]] = []
         self._pictures: list[list[np.ndarray]] = []  # of each kept step
         self._every = 1
 
     def add(self, step: RecordStep, number: int) -> None:
         """Add a step. Of a long episode only every second picture is kept, then every fourth, and so on."""
-        for name, values in self._values.items():
-            values.append(np.asarray(step.values[name], np.float32))
         self.times_s.append(step.time_s)
+        self._values.append(step.values)
         if number % self._every == 0:
             self._pictures.append([_colour(image)[::PIXEL_STEP, ::PIXEL_STEP] for image in step.images])
         if len(self._pictures) > 2 * SAMPLED:
@@ -280,19 +282,19 @@ class _Gathered:
 
     def stats(self, rate_hz: int, number: int, start: int, task: int) -> Stats:
         """Statistics of each column, in LeRobot's shapes: (3, 1, 1) for pictures, with values from 0 to 1, and (2,) for pins."""
-        length = len(self.times_s)
-        found = {}
-        for column, pictures in zip(self._images, zip(*self._pictures, strict=True), strict=True):
+        length, found = len(self.times_s), {}
+        images = [image_column(view) for view in self._about.views]
+        for column, pictures in zip(images, zip(*self._pictures, strict=True), strict=True):
             pixels = np.stack(pictures).reshape(-1, 3) / 255.0
             found[column] = {key: value.reshape(-1, 1, 1) for key, value in _deviations(pixels).items()}
-        for name, values in self._values.items():
-            stacked = np.stack(values).astype(float)
+        for name in self._about.numbers:
+            stacked = np.stack([np.asarray(values[name], np.float32) for values in self._values]).astype(float)
             found[channel_of(name).column] = _deviations(stacked.reshape(-1, stacked.shape[-1]))
         frames = np.arange(length)
         counters = (frames, np.full(length, number), start + frames, np.full(length, task))
         plain = {TIME: np.array(self.times_s), "timestamp": frames / rate_hz} | dict(zip(COUNTERS, counters, strict=True))
         found |= {name: _deviations(np.asarray(values, float)[:, None]) for name, values in plain.items()}
-        return {name: each | {"count": np.array([len(self._pictures) if name in self._images else length])} for name, each in found.items()}
+        return {name: each | {"count": np.array([len(self._pictures) if name in images else length])} for name, each in found.items()}
 
 
 def _deviations(rows: np.ndarray) -> dict[str, np.ndarray]:
@@ -324,14 +326,6 @@ def _together(a: Stats, b: Stats) -> Stats:
             "count": old["count"] + new["count"],
         }
     return found
-
-
-def _open_film(path: Path, rate_hz: int, size_px: tuple[int, int]) -> cv2.VideoWriter:
-    """A video to which frames are written."""
-    film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*FOURCC), float(rate_hz), size_px)
-    if not film.isOpened():
-        raise RecordError(f"this OpenCV can't write {FOURCC} videos; leave out `video`")
-    return film
 
 
 def lerobot_records(folder: Path) -> Records:

@@ -320,10 +320,8 @@ class LiveSource(Connection):
         if picture.image.max(initial=0) < BLACK_LEVEL:
             return "the picture is black; check the sensor's lamps and the camera's exposure"
         if self.notices_late and (age_s := time.monotonic() - picture.time_s) > LATE_S:
-            return (
-                f"the picture's time stamp is {age_s:.0f} s old; set the clock of the camera's computer to that of this one, "
-                "or look for what delays the pictures"
-            )
+            remedy = "set the clock of the camera's computer to that of this one, or look for what delays the pictures"
+            return f"the picture's time stamp is {age_s:.0f} s old; {remedy}"
         if self._still is None or not np.array_equal(self._still[0], picture.image):
             self._still = (picture.image, picture.time_s, 1)
             return ""

@@ -94,9 +94,8 @@ def examine_sensor(
         There is no such camera, or it delivers no frame.
     """
     if detector is not None and detector.method != "twin":
-        raise FrameError(
-            f"{detector.name}: tuned for method '{detector.method}', `pipeline` takes method 'twin'; run 'twin tune' without `method`"
-        )
+        remedy = "`pipeline` takes method 'twin'; run 'twin tune' without `method`"
+        raise FrameError(f"{detector.name}: tuned for method '{detector.method}', {remedy}")
     views = []
     if no_contact is not None and (pushes or twist is not None):
         sensor, view = register_files(sensor, no_contact, pushes, twist=twist, form=form, out=out)

@@ -244,7 +244,6 @@ class LeRobotArm(Connection):
     def _shape(self, name: str) -> tuple[int, int, int]:
         camera = self.cameras[name]
         if camera.height is None or camera.width is None:
-            raise DeviceError(
-                f"camera '{name}': its size is not known before it is connected; name its sensor, or give its width and height"
-            )
+            remedy = "name its sensor, or give its width and height"
+            raise DeviceError(f"camera '{name}': its size is not known before it is connected; {remedy}")
         return camera.height, camera.width, 3

@@ -133,6 +133,7 @@ def _address(target: str) -> tuple[str, int]:
 
 
 View = RerunView | LivePage
+Hear = Callable[[Frame, Estimate], None]
 
 
 @dataclass
@@ -152,7 +153,7 @@ class LiveSession:
     source: FrameSource
     estimator: Estimator
     record: SessionWriter | None = None
-    on_estimate: Callable[[Frame, Estimate], None] | None = None
+    on_estimate: Hear | None = None
     newest: tuple[Frame, Estimate] | None = None
     count: int = 0
     valid: int = 0
@@ -404,12 +405,7 @@ class WatchResult:
 
 
 def watch(
-    plan: WatchPlan,
-    model: SensorModel,
-    *,
-    name: str = "",
-    on_shown: Callable[[str], None] | None = None,
-    on_estimate: Callable[[Frame, Estimate], None] | None = None,
+    plan: WatchPlan, model: SensorModel, *, name: str = "", on_shown: Callable[[str], None] | None = None, on_estimate: Hear | None = None
 ) -> WatchResult:
     """Estimate the pose in every frame that the camera or the session delivers, until the plan's end or Ctrl-C.
 

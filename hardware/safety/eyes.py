@@ -273,9 +273,8 @@ class FreshFrames:
             self._stopped = f"{why}; {error}"
 
     def _error(self, why: str) -> BlindError:
-        return BlindError(
-            f"{self._source.name}: {why}; {self._arm.name} moves only with fresh frames; check the camera, and what else this computer does"
-        )
+        rule = f"{self._arm.name} moves only with fresh frames; check the camera, and what else this computer does"
+        return BlindError(f"{self._source.name}: {why}; {rule}")
 
 
 def pieces_to(start: np.ndarray, target: np.ndarray, near_mm: float) -> list[np.ndarray]:

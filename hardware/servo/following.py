@@ -159,10 +159,8 @@ class FollowPlan:
         if not self.camera:
             if kind_of(self.arm) != "simulated":
                 open_arm(self.arm)  # an arm that does not exist is reported first; nothing is opened
-                raise OptionError(
-                    f"`arm` {quote(self.arm)} needs a camera: give the sensor's with `camera`; `camera=twin` renders frames for the pose "
-                    "that the arm reports, and these do not show the real contact"
-                )
+                twin = "`camera=twin` renders frames for the pose that the arm reports, and these do not show the real contact"
+                raise OptionError(f"`arm` {quote(self.arm)} needs a camera: give the sensor's with `camera`; {twin}")
             object.__setattr__(self, "camera", TWIN)
 
 
@@ -194,11 +192,9 @@ class Followed:
         if np.isfinite(m.completed):
             round_mm = np.linalg.norm(np.diff(self.outline_mm, axis=0), axis=1).sum()
             out[0] += f", {self.path.along_mm.max():.0f} of {round_mm:.0f} mm along the outline, losses of contact: {m.lost_contacts:g}"
-            entries = f"path error {m.path_error_mm:.3f} mm; estimates off by {m.depth_error_mm:.3f} mm, {m.angle_error_deg:.2f} deg; "
-            out[2:2] = [
-                f"{entries if np.isfinite(m.path_error_mm) else ''}"  # a policy gives no estimate
-                f"held to {m.hold_depth_mm:.3f} mm, {m.hold_angle_deg:.2f} deg"
-            ]
+            off = f"path error {m.path_error_mm:.3f} mm; estimates off by {m.depth_error_mm:.3f} mm, {m.angle_error_deg:.2f} deg; "
+            off = off if np.isfinite(m.path_error_mm) else ""  # a policy gives no estimate
+            out.insert(2, f"{off}held to {m.hold_depth_mm:.3f} mm, {m.hold_angle_deg:.2f} deg")
         else:
             out[0] += "; the true position of the object is unknown, so errors against it are not measured (`known_place` if it is known)"
         return out + ([in_short(f"ended early: {self.failure}")] if self.failure else [])
@@ -461,9 +457,8 @@ def _write_study(out: Path, study: ServoStudy) -> Path:
         else:
             page_of_run = Cell(name, href=f"{folder_name(model)}/{name}/index.html")
             rows.append({"model": model, "object": page_of_run, "end": run.failure or "all steps made", **asdict(run.measures)})
-    page.table(
-        rows, ["model", "object", *columns, "end"], caption="Smoothness is the paper's S; local smoothness does not depend on the axes."
-    )
+    caption = "Smoothness is the paper's S; local smoothness does not depend on the axes."
+    page.table(rows, ["model", "object", *columns, "end"], caption=caption)
     if (out / "study.png") in study.written:
         page.figures(PagePicture(out / "study.png", "The tool's path (thin) around each object (wide), for each model", width_px=1000))
     page.download(out / "study.csv", "all measures")

@@ -15,6 +15,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Protocol, cast
 
 import numpy as np
@@ -170,18 +171,6 @@ Decide = Callable[[GripStep], tuple[np.ndarray, float]]
 """The tool's motion (6,) in the arm's base frame, mm and deg, and the gripper's next width, mm."""
 
 
-@dataclass(frozen=True)
-class _AllSources:
-    """The cameras as one, with all that ``FreshFrames`` uses: it is blind if any of them is."""
-
-    sources: Mapping[str, FrameSource]
-    name = "cameras"
-    same_s = None
-
-    def blind(self) -> str:
-        return "; ".join(f"{name}: {why}" for name, source in self.sources.items() if (why := source.blind()))
-
-
 def run_gripper(
     rig: GripperRig,
     pipelines: Mapping[str, Pipeline],
@@ -224,10 +213,15 @@ def run_gripper(
         The arm fails or refuses a move, or there are no frames or no valid pins for too long.
     """
     found: list[GripStep] = []
+
+    def blind() -> str:
+        return "; ".join(f"{name}: {why}" for name, source in rig.sources.items() if (why := source.blind()))
+
+    cameras = cast(FrameSource, SimpleNamespace(name="cameras", same_s=None, blind=blind))  # as one: it is blind if any of them is
     with ExitStack() as stack:
         stack.enter_context(rig.connect())
         about = {"arm": rig.arm.name, "gripper": rig.gripper.name, "sensors": list(rig.sources)}
-        watch, eyes = ArmWatch(rig.arm), FreshFrames(rig.arm, cast(FrameSource, _AllSources(rig.sources)))
+        watch, eyes = ArmWatch(rig.arm), FreshFrames(rig.arm, cameras)
         records = {}
         for name, source in rig.sources.items():
             if out is not None:

@@ -353,10 +353,8 @@ class ServoLoop:
         """Note that the arm lags behind its target; raise ``DeviceError`` if it has done so for too long."""
         self._behind_since = now_s if self._behind_since is None else self._behind_since
         if (behind_s := now_s - self._behind_since) > MOVE_TIMEOUT_S:
-            raise DeviceError(
-                f"{self.arm.name}: reports that it moves, but has not come near its target for {behind_s:.1f} s; look for an obstacle, "
-                "call clear_error(), then begin again"
-            )
+            fault = f"reports that it moves, but has not come near its target for {behind_s:.1f} s"
+            raise DeviceError(f"{self.arm.name}: {fault}; look for an obstacle, call clear_error(), then begin again")
 
     def _record(self, state: ArmState, from_pose: np.ndarray, sent: np.ndarray, *, fresh: bool, taken_s: float) -> None:
         """Store the record of a move, and pass it to ``on_step``."""
@@ -453,10 +451,8 @@ class ServoLoop:
 def require_labels(mounting: Mounting, names: tuple[str, ...]) -> None:
     """Raise ``DeviceError`` unless a model has the labels that following needs. Call it before anything moves."""
     if not {mounting.depth_label, mounting.angle_label} <= set(names):
-        raise DeviceError(
-            f"the model estimates {', '.join(names)}; following a surface needs the experiment's {mounting.depth_label} and "
-            f"{mounting.angle_label}"
-        )
+        needed = f"{mounting.depth_label} and {mounting.angle_label}"
+        raise DeviceError(f"the model estimates {', '.join(names)}; following a surface needs the experiment's {needed}")
 
 
 def _apart_mm(one: np.ndarray, other: np.ndarray) -> float:

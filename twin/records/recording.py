@@ -130,10 +130,8 @@ def _times(recording: Recording, rows: np.ndarray, notes: list[str]) -> np.ndarr
         times_s = numbers(recording.labels[TIME_S][rows])
         if np.isfinite(times_s).all() and (np.diff(times_s) >= 0).all():
             return times_s
-        note = (
-            f"column {TIME_S} does not increase everywhere, or has cells without a number; such episodes get {NOMINAL_HZ:g} frames per "
-            "second"
-        )
+        fault = "does not increase everywhere, or has cells without a number"
+        note = f"column {TIME_S} {fault}; such episodes get {NOMINAL_HZ:g} frames per second"
         if len(rows) > 1 and note not in notes:
             notes.append(note)
     return np.arange(len(rows)) / NOMINAL_HZ

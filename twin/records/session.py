@@ -266,11 +266,10 @@ def session_records(folder: Path) -> Records:
     names: dict[str, tuple[str, ...]] = {}
     if "sent_mm" in first:
         counts["action"], names = 7, {"action": (*POSE_AXES, "width")}
-    size_px = image.shape[1], image.shape[0]
     about = About(
         sensor=str(session.about.get("sensor", "")),
         form=session.form,
-        size_px=size_px,
+        size_px=(image.shape[1], image.shape[0]),
         gray=image.ndim == 2,
         numbers={name: counts[name] for name in CHANNELS if name in _KEYS and _KEYS[name][0] in first and counts[name]},
         estimates=estimates,

@@ -234,11 +234,8 @@ def estimate_line(estimate: Estimate) -> dict:
 
 def same_estimates(steps: list[dict], values: list[np.ndarray]) -> int:
     """Number of steps of a session whose stored estimates equal exactly the present ones (K,)."""
-    same = 0
-    for step, value_now in zip(steps, values, strict=False):
-        kept = np.array([np.nan if value is None else value for value in step.get("value", [])], float)
-        same += np.array_equal(kept, value_now, equal_nan=True)
-    return same
+    kept = (np.array(step.get("value", []), float) for step in steps)  # None becomes NaN
+    return sum(np.array_equal(then, now, equal_nan=True) for then, now in zip(kept, values, strict=False))
 
 
 class Shower(AbstractContextManager["Shower"]):

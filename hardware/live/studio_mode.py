@@ -67,10 +67,8 @@ class WatchedArm:
     """
 
     def __init__(self, text: str, source: FrameSource | None = None, pipeline: Pipeline | None = None) -> None:
-        arm, kind = open_arm(text), kind_of(text)
-        self._arm = SafeArm(arm, load_limits(kind))
-        self.name = self._arm.name
-        self.armed = False
+        self._arm = SafeArm(open_arm(text), load_limits(kind_of(text)))
+        self.name, self.armed = self._arm.name, False
         self._moves = threading.Lock()
         self._source, self._pipeline = source, pipeline
         self._eyes = FreshFrames(self._arm, source) if source is not None else None
@@ -207,8 +205,7 @@ class CameraFeed:
         self._session = LiveSession(self._source, model)
         self.ended = ""  # why no more frames come
         self._writer: SessionWriter | None = None
-        self._writing = threading.Lock()
-        self._end = threading.Event()
+        self._writing, self._end = threading.Lock(), threading.Event()
         self._thread: threading.Thread | None = None
 
     def start(self, on_frame: Callable[[LiveFrame], None], on_end: Callable[[str], None]) -> None:

@@ -436,13 +436,11 @@ def study_servo(plan: ServoStudyPlan, out: Path, *, progress: Progress = silent)
     reasons = [said for said in found.values() if isinstance(said, str)]
     if reasons and len(reasons) == len(found):
         raise TwinError(f"none of {format_count(len(found), 'runs')} made a step; the first: {reasons[0]}")
-    made = ServoStudy(found, [])
-    made.written.append(write_rows(out / "study.csv", made.rows))
+    study = ServoStudy(found, [])
     pictures = [(*key, run.path, run.outline_mm) for key, run in found.items() if isinstance(run, Followed)]
-    if pictures:
-        made.written.append(write_chart(out / "study.png", partial(comparison_figure, pictures)))
-    made.written.insert(0, _write_study(out, made))
-    return made
+    files = [write_rows(out / "study.csv", study.rows), write_chart(out / "study.png", partial(comparison_figure, pictures))]
+    study.written.extend([_write_study(out, study), *files])
+    return study
 
 
 def _write_study(out: Path, study: ServoStudy) -> Path:
@@ -459,8 +457,7 @@ def _write_study(out: Path, study: ServoStudy) -> Path:
             rows.append({"model": model, "object": page_of_run, "end": run.failure or "all steps made", **asdict(run.measures)})
     caption = "Smoothness is the paper's S; local smoothness does not depend on the axes."
     page.table(rows, ["model", "object", *columns, "end"], caption=caption)
-    if (out / "study.png") in study.written:
-        page.figures(PagePicture(out / "study.png", "The tool's path (thin) around each object (wide), for each model", width_px=1000))
+    page.figures(PagePicture(out / "study.png", "The tool's path (thin) around each object (wide), for each model", width_px=1000))
     page.download(out / "study.csv", "all measures")
     return page.write(out / "index.html")
 

@@ -183,6 +183,11 @@ class ServoLoop:
     estimator : Estimator
     settings : LoopSettings
     hooks : LoopHooks, optional
+
+    Attributes
+    ----------
+    notes : list of str
+        Problems of the run.
     """
 
     def __init__(self, rig: Rig, servo: ServoSpec, estimator: Estimator, settings: LoopSettings, hooks: LoopHooks | None = None) -> None:
@@ -195,14 +200,9 @@ class ServoLoop:
         self._sent: np.ndarray | None = None  # pose (6,) where the arm's queue ends, if it has a queue
         self._behind_since: float | None = None  # when the arm began to lag too far behind for a new target
         self._view, self._memory = _NewestFrame(), Memory()
-        self._watch, self._axis = self.mover.watch, self.mover.axis
+        self._watch, self._axis, self.notes = self.mover.watch, self.mover.axis, self.mover.notes
         self._arrived_s: float | None = None  # when the arm came to the object; None once a frame exposed after that was used
         self._started_s = self._ended_s = 0.0
-
-    @property
-    def notes(self) -> list[str]:
-        """Problems of the run."""
-        return self.mover.notes
 
     def run(self, start_pose: np.ndarray) -> Timing:
         """Approach the start pose (6,), follow the surface for the number of steps of the settings, retreat.

@@ -86,12 +86,10 @@ class LeRobotWriter(FolderWriter):
                 self._tasks = [str(task) for task in parquet.read_table(self.folder / TASKS)["__index_level_0__"].to_pylist()]
             stats = read_json(self.folder / STATS)
             self._stats = {key: {k: np.asarray(v, float) for k, v in each.items()} for key, each in stats.items()}
-        videos = [VIDEO_PATH.replace("{video_key}", image) for image in self._images]
-        for pattern in (DATA_PATH, EPISODES_PATH, *videos):  # files of a run that was killed
-            for path in self.folder.glob(pattern.partition("/chunk")[0] + "/chunk-*/file-*"):
-                chunk, file = (int(part.split("-")[1].split(".")[0]) for part in path.parts[-2:])
-                if chunk * CHUNK_FILES + file >= self._file:
-                    path.unlink()
+        for path in self.folder.glob("**/chunk-*/file-*"):
+            chunk, file = (int(part.split("-")[1].split(".")[0]) for part in path.parts[-2:])
+            if chunk * CHUNK_FILES + file >= self._file:  # of a run that was killed
+                path.unlink()
         return [_facts_of(row) for row in rows]
 
     def _groups(self, episodes: Iterator[Episode]) -> Iterator[list[dict[str, Any]]]:

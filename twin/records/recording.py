@@ -7,6 +7,7 @@ Recordings of any origin, collections, and simulated data sets with their truth 
 import csv
 import json
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -202,11 +203,9 @@ def _read_requested_poses(path: Path, recording: Recording) -> dict[str, np.ndar
         return {}
     asked = {}
     for line in read_regular(path / LOG, 1_000_000_000).decode("utf-8", "replace").splitlines():
-        try:
+        with suppress(ValueError, KeyError, TypeError, RecursionError):
             found = json.loads(line)
             asked[str(found["image_name"])] = float32(found["asked"][:6], 6)
-        except (ValueError, KeyError, TypeError, RecursionError):
-            continue
     none = np.full(6, np.nan, np.float32)
     return {"action": np.stack([asked.get(name, none) for name in recording.names])} if asked else {}
 

@@ -190,11 +190,9 @@ class Ros2Writer(FolderWriter):
 
     def _groups(self, episodes: Iterator[Episode]) -> Iterator[list[dict[str, Any]]]:
         for episode in episodes:
-            first = next(episode.steps(), None)
-            if first is not None:
-                facts: dict[str, Any] = episode.facts()
-                path = self.folder / _name(len(self.facts))
-                write_with(path, partial(self._fill, episode=episode, facts=facts))
+            if next(episode.steps(), None) is not None:
+                facts = episode.facts()
+                write_with(self.folder / _name(len(self.facts)), partial(self._fill, episode=episode, facts=facts))
                 yield [facts]
 
     def _fill(self, file: Any, *, episode: Episode, facts: dict[str, Any]) -> None:

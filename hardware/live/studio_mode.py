@@ -200,6 +200,7 @@ class CameraFeed:
         model = PinsAlone(sensor, self._source.form, lacking) if model is None else model.seeking_rest()
         model.check(sensor, self._source.form)
         self.model = model
+        self.pipeline = Pipeline(model.sensor, model.form, model.pipeline.reference)  # a separate one for the page's thread
         self.robot = WatchedArm(arm, self._source, model.pipeline) if arm else None
         self.name = self._source.name + (f" and {self.robot.name}" if self.robot else "")
         self._session = LiveSession(self._source, model)
@@ -306,7 +307,6 @@ class LiveMode(PageMode):
         self._twin, self._out = twin, plan.out
         self._feed: CameraFeed | None = None
         self._connecting = threading.RLock()  # the page calls from many threads, and a feed that is forgotten would keep its arm
-        self._pipeline: Pipeline | None = None
         self._health: list[str] = []
         self._last: LiveFrame | None = None
         self._shots = self.newest(self._show, "live")
@@ -360,7 +360,6 @@ class LiveMode(PageMode):
             if contact.model is None and lacking == MODEL_LOADING:
                 raise TwinError(f"{MODEL_LOADING}; press 'Connect' again in a moment")
             feed = CameraFeed(self._camera.value.strip(), self._arm.value.strip(), contact.setup.sensor, contact.model, lacking)
-            self._pipeline = Pipeline(feed.model.sensor, feed.model.form, feed.model.pipeline.reference)
             self._feed = feed
             feed.start(self._shots.give, self._report_end)
             arm = "" if feed.robot is None else f"{feed.robot.name}: {feed.robot.limits()}"
@@ -432,12 +431,11 @@ class LiveMode(PageMode):
         self._robot().nudge("xyz".index(axis), float(by))
 
     def _show(self, shot: LiveFrame) -> None:
-        feed, pipeline = self._feed, self._pipeline
-        self._last = shot
-        if feed is None or pipeline is None or not self._active:
+        feed, self._last = self._feed, shot
+        if feed is None or not self._active:
             return
-        seen = pins_in(shot.frame, shot.estimate, pipeline)
-        pictures = frame_pictures(feed.model.sensor, pipeline.reference, shot.frame, seen)
+        seen = pins_in(shot.frame, shot.estimate, feed.pipeline)
+        pictures = frame_pictures(feed.model.sensor, feed.pipeline.reference, shot.frame, seen)
         robot = feed.robot
         numbers = [
             badge("ended" if feed.ended else "live", "moving") + (badge("recording", "moving") if self._record.value else ""),

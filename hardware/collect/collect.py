@@ -97,7 +97,9 @@ class Collection:
         if known := meta.is_file():
             before = read_json(meta, error=DeviceError, again="remove it if the folder holds no contacts yet")
             other = [key for key in about if before.get(key) != about[key]]
-            begun = self.has_rest or (table.is_file() and table.read_bytes().count(b"\n") > 1)  # whatever the lines after the header are
+            begun = self.rest.is_file() or (
+                table.is_file() and table.read_bytes().count(b"\n") > 1
+            )  # whatever the lines after the header are
             if other and begun:  # else a start failed, and nothing is lost
                 settings = ", ".join(other)
                 raise DeviceError(f"{self.folder}: holds a collection with other settings ({settings}); repeat them or give another `out`")
@@ -133,11 +135,6 @@ class Collection:
         if rows[:1] != [list(COLUMNS)] or any(len(row) != len(COLUMNS) for row in rows):
             raise DeviceError(f"{table}: is not the table of a collection; give another `out`")
         return len(rows) - 1
-
-    @property
-    def has_rest(self) -> bool:
-        """Whether the frame without contact has been taken."""
-        return self.rest.is_file()
 
     @property
     def rest(self) -> Path:
@@ -275,7 +272,7 @@ def collect(
                 stops.mover.enable()
                 state = stops.go_around(np.zeros(6), CLEAR_MM)
                 at_object = True
-                if not collection.has_rest:
+                if not collection.rest.is_file():
                     rest = stops.frame_after(state)
                     collection.keep_rest(rest)
                     if on_rest is not None:

@@ -99,7 +99,7 @@ class Collection:
             other = [key for key in about if before.get(key) != about[key]]
             begun = self.rest.is_file() or (
                 table.is_file() and table.read_bytes().count(b"\n") > 1
-            )  # whatever the lines after the header are
+            )  # whatever these lines are
             if other and begun:  # else a start failed, and nothing is lost
                 settings = ", ".join(other)
                 raise DeviceError(f"{self.folder}: holds a collection with other settings ({settings}); repeat them or give another `out`")

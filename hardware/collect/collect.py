@@ -97,10 +97,8 @@ class Collection:
         if known := meta.is_file():
             before = read_json(meta, error=DeviceError, again="remove it if the folder holds no contacts yet")
             other = [key for key in about if before.get(key) != about[key]]
-            begun = self.rest.is_file() or (
-                table.is_file() and table.read_bytes().count(b"\n") > 1
-            )  # whatever these lines are
-            if other and begun:  # else a start failed, and nothing is lost
+            begun = table.is_file() and table.read_bytes().count(b"\n") > 1  # whatever the lines after the header are
+            if other and (begun or self.rest.is_file()):  # else a start failed, and nothing is lost
                 settings = ", ".join(other)
                 raise DeviceError(f"{self.folder}: holds a collection with other settings ({settings}); repeat them or give another `out`")
         elif contents(self.folder):

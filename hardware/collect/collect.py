@@ -268,7 +268,7 @@ def collect(
         try:
             with stops.mover.watch.alert():
                 stops.mover.enable()
-                state = stops.go_around(np.zeros(6), CLEAR_MM)
+                state = stops.go(np.zeros(6), CLEAR_MM, around=True)
                 at_object = True
                 if not collection.rest.is_file():
                     rest = stops.frame_after(state)
@@ -292,7 +292,7 @@ def _collect_one(stops: "_Stops", experiment: ExperimentSpec, collection: Collec
     """
     clear, tap = np.array(experiment.clear), np.array(experiment.tap)
     before = contact.pose - contact.move + clear
-    stops.go_around(before, LIFT_MM)
+    stops.go(before, LIFT_MM, around=True)
     stops.frame_after(stops.go(before))
     stops.frame_after(stops.go(before + tap))
     confirmed = stops.go(contact.pose + clear + tap)
@@ -313,24 +313,17 @@ class _Stops:
     work: WorkFrame
     frame_timeout_s: float
 
-    def go(self, label: np.ndarray, away_mm: float = 0.0) -> ArmState:
-        """Move straight to work coordinates (6,), ``away_mm`` back along the approach. Returns the state there."""
+    def go(self, label: np.ndarray, away_mm: float = 0.0, *, around: bool = False) -> ArmState:
+        """Move to work coordinates (6,), ``away_mm`` back along the approach, straight or around the object. Returns the state there."""
         with self.mover.watch.doing("moving"):
-            return self.mover.go(self._pose(label, away_mm))
-
-    def go_around(self, label: np.ndarray, away_mm: float) -> ArmState:
-        """As ``go``, but on a path around the object."""
-        with self.mover.watch.doing("moving"):
-            return self.mover.go_around(self._pose(label, away_mm))
+            pose = self.work.base_pose(label, self.mover.arm.state().pose, away_mm=away_mm)
+            return self.mover.go_around(pose) if around else self.mover.go(pose)
 
     def frame_after(self, state: ArmState) -> Frame:
         """The first frame exposed after a state."""
         remedy = "check the camera, then repeat the command to continue"
         with ErrorsAs(TimeoutError, lambda error: DeviceError(f"the arm stands still, but {error}; {remedy}")):
             return self.mover.frame_after(state.time_s, timeout_s=self.frame_timeout_s)
-
-    def _pose(self, label: np.ndarray, away_mm: float) -> np.ndarray:
-        return self.work.base_pose(label, self.mover.arm.state().pose, away_mm=away_mm)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 from hardware.ros2.dds import Participant, Reader, Writer, domain_id
 from scenes.files import quote
 from twin.errors import ErrorsAs
-from twin.records import ros2_messages as ros
+from twin.records import ros2 as ros
 from twin.rig.arm_pose import matrix_of, pose_of
 
 LOG = logging.getLogger(__name__)

@@ -5,8 +5,7 @@ import time
 
 import numpy as np
 
-from hardware.cameras.coded import jpeg_of
-from hardware.cameras.picture_page import STREAM, WAIT_S, JpegServer, StreamPart
+from hardware.cameras.mjpeg import STREAM, WAIT_S, JpegServer, StreamPart, jpeg_of
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.emulators.faults import EVERY_NTH, SECONDS, Emulator, Fault, Faults
 from hardware.errors import DeviceError

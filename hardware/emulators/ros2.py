@@ -13,7 +13,7 @@ from hardware.arms.ros2 import COMMANDS, JOINTS, POSE, STAGE, measure_way, topic
 from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Fault, Faults, Range
 from hardware.errors import DeviceError
 from hardware.ros2.dds import Participant, Reader, Writer, domain_id
-from twin.records import ros2_messages as ros
+from twin.records import ros2 as ros
 from twin.rig.arm_pose import matrix_of, pose_of
 
 PERIOD_S = 0.01

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from hardware.arms.arm import ArmState
-from hardware.cameras.coded import jpeg_of
+from hardware.cameras.mjpeg import jpeg_of
 from hardware.cameras.reader import LiveSource
 from hardware.cameras.source import FrameSource
 from hardware.ros2.dds import Participant, Writer
@@ -27,7 +27,7 @@ from twin.estimate import Estimate, pins_in, readable_labels
 from twin.frames.forms import recording_to_raw
 from twin.geometry.pins import rest_pins
 from twin.pins import Pipeline
-from twin.records import ros2_messages as ros
+from twin.records import ros2 as ros
 from twin.rig.arm_pose import matrix_of
 from twin.types import Form, Frame
 
@@ -246,7 +246,7 @@ class Ros2Publisher:
             if all(name in known for name in _FORCES):
                 force_n = np.array([known[name] for name in _FORCES])
                 self._send("wrench", at_ns, lambda: {"header": header, "wrench": ros.wrench(force_n, np.full(3, np.nan))})
-                self._send("contact", at_ns, lambda: {"data": bool(np.linalg.norm(force_n) > ros.TOUCHES_N)})
+                self._send("contact", at_ns, lambda: {"data": int(np.linalg.norm(force_n) > ros.TOUCHES_N)})
             if slip := [name for name in names if name.startswith("slip_")]:
                 self._send("slip", at_ns, lambda: ros.number_array(np.array([known[name] for name in slip]), ",".join(slip)))
         self._publish_pins(at_ns, frame, estimate)

@@ -20,8 +20,7 @@ from noisy_camera import NoisyCamera, number_of
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras import reader
 from hardware.cameras.choose import open_camera
-from hardware.cameras.coded import CONTENT_TYPE, Parts, jpeg_of, write_part
-from hardware.cameras.mjpeg import MjpegCamera
+from hardware.cameras.mjpeg import CONTENT_TYPE, MjpegCamera, Parts, jpeg_of, write_part
 from hardware.cameras.reader import FIRST_PERIODS, MOST_FAILED_READS, ReadFailed
 from hardware.cameras.source import FrameSource
 from hardware.cameras.twin import TwinCamera

@@ -14,8 +14,7 @@ from hardware.rig.geometry import HOLD_DEG, LastAxis, PlacedObject, turns_back_m
 from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import SafeArm
 from hardware.servo.following import steps_round
-from hardware.servo.loop import ServoLoop
-from hardware.servo.step import LoopSettings
+from hardware.servo.loop import LoopSettings, ServoLoop
 from hardware.workcell.build import Rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.rig.kinematics import Mounting

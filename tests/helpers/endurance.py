@@ -17,8 +17,7 @@ import psutil
 from free_ports import free_offset
 
 from hardware.arms.mg400_wire import DASHBOARD_PORT
-from hardware.servo.loop import Decided, ServoLoop
-from hardware.servo.step import LoopSettings
+from hardware.servo.loop import Decided, LoopSettings, ServoLoop
 from hardware.workcell.build import build_rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.errors import TwinError

@@ -46,7 +46,7 @@ from twin.frames.images import write_image
 from twin.pins import Pipeline
 from twin.pins.batch import voronoi_map
 from twin.records import open_records
-from twin.records.ros2_messages import decode
+from twin.records.ros2 import decode
 from twin.rig.kinematics import Mounting
 from twin.studio.live_page import LivePage, frame_pictures
 from twin.types import Form, Frame

@@ -1,6 +1,6 @@
 """Contact and friction on the skin: exact Coulomb contact at a few hundred nodes, with friction's memory.
 
-Forces f at the nodes displace the skin by u = C f (see ``compliance``) plus the correction of ``bending``. At every pose of the object the
+Forces f at the nodes displace the skin by u = C f (see ``compliance``) plus the bending of ``model``. At every pose of the object the
 solver looks for forces with which each node is in one of three states: it is clear of the object; it presses and sticks to its anchor; or
 it presses and slides at Coulomb's bound. It starts from the forces of the last pose, corrects one node at a time while it keeps the others
 fixed, and repeats this until no force changes (projected Gauss-Seidel: Jourdan, Alart & Jean 1998). Then it evaluates the bending again.
@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from training.surrogate.bending import bend, unbent
+from training.surrogate.model import LOOSE, Network, bend
 from training.surrogate.solids import distances_to
 from twin.compiled import compiled
 from twin.objects.analytic import CompiledSolid
@@ -112,8 +112,8 @@ class LinearContacts:
         node i (first), mm/N.
     count : int
         B.
-    bending : tuple of float32 arrays, optional
-        Arrays of the network that corrects the linear skin (see ``Bending.kernel``); by default the skin is linear.
+    bending : tuple of float32 arrays
+        Arrays of the network that corrects the linear skin (see ``Bending.kernel``).
     still_mm : float
         Change of the bending between two motions up to which one evaluation of it is enough for a load step. With more than 0, a motion in
         very small steps costs half.
@@ -146,13 +146,11 @@ class LinearContacts:
         Share of Coulomb's bound that the pressing nodes bear together.
     """
 
-    def __init__(
-        self, node_mm: FloatArray, answer: FloatArray, count: int, *, bending: tuple[FloatArray, ...] | None = None, still_mm: float = 0.0
-    ) -> None:
+    def __init__(self, node_mm: FloatArray, answer: FloatArray, count: int, *, bending: Network, still_mm: float = 0.0) -> None:
         size = len(node_mm)
         self.node_mm, self.answer = node_mm, np.ascontiguousarray(answer.transpose(0, 3, 2, 1), np.float32)
         self.radius_mm = float(np.linalg.norm(node_mm[0]))
-        self.bending, self.still_mm = unbent(size) if bending is None else bending, still_mm
+        self.bending, self.still_mm = bending, still_mm
         self.kind, self.sizes, self.turning = np.zeros(count, np.int64), np.zeros((count, SIZES)), np.zeros((count, 10))
         self.friction, self.compliance_mm_per_n, self.used = np.zeros((3, count))
         self.taken = np.tile(np.eye(4), (count, 1, 1))
@@ -207,9 +205,7 @@ class LinearContacts:
             Distance of the dome's centre from the object, and the cosine of the angle between the apex and the dome's place nearest to the
             object. They give the depth exactly, also where the deepest place lies between or beyond the nodes.
         """
-        gap, centre = np.empty((len(rows), len(self.node_mm))), np.empty((len(rows), 2))
-        _distances(rows, np.ascontiguousarray(T), self.node_mm, self.kind, self.sizes, gap, centre)
-        return gap, centre
+        return _distances(rows, np.ascontiguousarray(T), self.node_mm, self.kind, self.sizes)
 
 
 @compiled()
@@ -234,9 +230,8 @@ def between(start: FloatArray, stop: FloatArray, steps: int) -> FloatArray:
 
 
 @compiled()
-def _distances(
-    rows: IntArray, T: FloatArray, node: FloatArray, kind: IntArray, sizes: FloatArray, gap: FloatArray, centre: FloatArray
-) -> None:
+def _distances(rows: IntArray, T: FloatArray, node: FloatArray, kind: IntArray, sizes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    gap, centre = np.empty((len(rows), len(node))), np.empty((len(rows), 2))
     points, middle = np.empty_like(node), np.empty((1, 3))
     still, origin = np.zeros_like(node), np.zeros((1, 3))
     for r in range(len(rows)):
@@ -248,6 +243,7 @@ def _distances(
         distance, outward = distances_to(middle, kind[row], sizes[row])
         centre[r, 0] = distance[0]
         centre[r, 1] = -(turn[2, 0] * outward[0, 0] + turn[2, 1] * outward[0, 1] + turn[2, 2] * outward[0, 2])
+    return gap, centre
 
 
 @compiled(nogil=True)
@@ -257,7 +253,7 @@ def _follow(
     stop: FloatArray,
     node: FloatArray,
     answer: FloatArray,
-    bending: tuple[FloatArray, ...],
+    bending: Network,
     laws: Laws,
     nodes: Nodes,
     taken: FloatArray,
@@ -396,7 +392,7 @@ def _among(answer: FloatArray, near: IntArray, row: int, kept: Kept) -> FloatArr
     return c
 
 
-@compiled(fastmath={"reassoc", "contract", "arcp", "nsz"})
+@compiled(fastmath=LOOSE)
 def _solve(answer: FloatArray, at: Touching, nodes: Nodes, shift: FloatArray, friction: float, compliance: float, part: int) -> float:
     """Solve for the forces (M, 3) of the near nodes (q,) and the displacements (M, 3) of all nodes.
 
@@ -412,13 +408,10 @@ def _solve(answer: FloatArray, at: Touching, nodes: Nodes, shift: FloatArray, fr
     sunk = 0.0  # displacement of the compliant object along z
     for a in range(count):
         i = near[a]
+        x, y, z = here[i, 0] - anchor[i, 0], here[i, 1] - anchor[i, 1], here[i, 2] - anchor[i, 2]
         for p in range(3):
             n[a, p] = turn[p, 0] * normal[i, 0] + turn[p, 1] * normal[i, 1] + turn[p, 2] * normal[i, 2]
-            lag[a, p] = (
-                turn[p, 0] * (here[i, 0] - anchor[i, 0])
-                + turn[p, 1] * (here[i, 1] - anchor[i, 1])
-                + turn[p, 2] * (here[i, 2] - anchor[i, 2])
-            )
+            lag[a, p] = turn[p, 0] * x + turn[p, 1] * y + turn[p, 2] * z
         total, trace = compliance * n[a, 2] * n[a, 2], compliance
         for p in range(3):
             trace += c[a, p, p, a]

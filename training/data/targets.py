@@ -114,9 +114,7 @@ def unit_of(name: str) -> str:
     return {"force": "N", "torque": "Nmm"}.get(kind, "")
 
 
-def choose_targets(
-    recording: Recording, columns: str | tuple[str, ...], rows: np.ndarray, depth_per_move: float, problems: list[str]
-) -> Targets:
+def choose_targets(recording: Recording, columns: str | tuple, rows: np.ndarray, depth_per_move: float, problems: list[str]) -> Targets:
     """Labels of the recording's frames ``rows`` (M,); ``depth_per_move`` is c above.
 
     Raises
@@ -141,13 +139,10 @@ def choose_targets(
             f"choose columns of these, or one of {', '.join((*PRESETS, CONTACT))}"
         )
     raw = np.column_stack([_numbers(recording.labels[name], name, problems) for name in names])[rows]
-    both = all(name in recording.labels for name in (SHEAR, TURN))
-    move = np.full((len(rows), 2), np.nan)
-    if both:
+    move, executed = np.full((len(rows), 2), np.nan), np.full(len(rows), np.nan)
+    if SHEAR in recording.labels and TURN in recording.labels:
         move = np.column_stack([_numbers(recording.labels[name], name, []) for name in (SHEAR, TURN)])[rows]
-    executed = np.full(len(rows), np.nan)
-    known = read_executed(recording.path, [recording.names[row] for row in rows], problems) if both else {}
-    if known:
+        known = read_executed(recording.path, [recording.names[row] for row in rows], problems)
         executed = np.array([known.get(recording.names[row], np.nan) for row in rows])
     x_mm = _numbers(recording.labels["pose_1"], "pose_1", [])[rows] if "pose_1" in recording.labels else np.zeros(len(rows))
     right = correct_labels(names, raw, executed, move, depth_per_move, np.nan_to_num(x_mm))

@@ -13,7 +13,7 @@ turns under the force so far; at the end of the motion this is repeated until th
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -56,13 +56,15 @@ MOST_SETTLING = 2
 
 
 class Laws(NamedTuple):
-    """What B contacts obey: the attributes of ``LinearContacts`` of these names."""
+    """What B contacts obey, and their poses and friction: the attributes of ``LinearContacts`` of these names."""
 
     kind: IntArray
     sizes: FloatArray
     friction: FloatArray
     compliance_mm_per_n: FloatArray
     turning: FloatArray
+    taken: FloatArray
+    used: FloatArray
 
 
 class Nodes(NamedTuple):
@@ -181,11 +183,11 @@ class LinearContacts:
 
     def move(self, rows: IntArray, start: FloatArray, stop: FloatArray) -> None:
         """Move the objects of some rows (R,) from poses ``start`` (R, 4, 4) to ``stop``: in a straight line, with a turn about one axis."""
-        skin = self.node_mm, self.answer, self.bending
+        skin = self.node_mm, self.answer, self.bending, self.still_mm
 
         def follow(which: slice) -> None:
             given = [np.ascontiguousarray(values[which]) for values in (rows, start, stop)]
-            _follow(*given, *skin, *self._state, self.taken, self.used, self.still_mm, self._kept)
+            _follow(*given, skin, *self._state, self._kept)
 
         threads = min(len(rows) // ROWS_OF_A_THREAD, MOST_THREADS)
         if threads < 2:
@@ -247,24 +249,12 @@ def _distances(rows: IntArray, T: FloatArray, node: FloatArray, kind: IntArray, 
 
 
 @compiled(nogil=True)
-def _follow(
-    rows: IntArray,
-    start: FloatArray,
-    stop: FloatArray,
-    node: FloatArray,
-    answer: FloatArray,
-    bending: Network,
-    laws: Laws,
-    nodes: Nodes,
-    taken: FloatArray,
-    used: FloatArray,
-    still_mm: float,
-    kept: Kept,
-) -> None:
+def _follow(rows: IntArray, start: FloatArray, stop: FloatArray, skin: tuple[Any, ...], laws: Laws, nodes: Nodes, kept: Kept) -> None:
     """Solve each row's motion from ``start`` to ``stop`` (R, 4, 4) in load steps.
 
-    The arrays of all B rows are those of ``LinearContacts``.
+    The arrays of all B rows are those of ``LinearContacts``; ``skin`` are its nodes, their compliance, its bending and ``still_mm``.
     """
+    node, answer, bending, still_mm = skin
     here = np.empty_like(node)
     shift = np.empty((3, len(node)), np.float32)
     near = np.empty(len(node), np.int64)
@@ -277,9 +267,9 @@ def _follow(
         mine = Nodes(force[row], moved[row], bent[row], anchor[row], seen[row], before[row], held[row], slides[row])
         for step in range(steps + MOST_SETTLING):
             T = _deflect_arm(way[min(step, last)], laws.turning[row], mine.force_n)
-            if step > last and moved_mm(taken[row], T, node[0, 2]) <= SETTLED_MM:
+            if step > last and moved_mm(laws.taken[row], T, node[0, 2]) <= SETTLED_MM:
                 break
-            taken[row] = T
+            laws.taken[row] = T
             turn, place = T[:3, :3], T[:3, 3]
             count, change, off = 0, np.inf, np.inf
             gap = before[row]
@@ -304,7 +294,7 @@ def _follow(
                     off = _solve(answer, Touching(near[:count], among, turn, here, gap, normal), mine, shift, mu, soft, part)
             if count:
                 _to_object_frame(node, mine.moved_mm, turn, place, here)
-                used[row] = _record_friction(Touching(near[:count], among, turn, here, gap, normal), mine, mu)
+                laws.used[row] = _record_friction(Touching(near[:count], among, turn, here, gap, normal), mine, mu)
             before[row], seen[row] = gap, here
 
 

@@ -26,7 +26,6 @@ from typing import Any
 
 import numpy as np
 
-from scenes.base import Section
 from scenes.sensor import SensorSpec
 from training.surrogate.compliance import NODE_RINGS, POLAR_DEG
 from training.surrogate.symmetry import ring_directions, symmetries
@@ -378,18 +377,14 @@ def _of_arrays(about: dict[str, Any], arrays: Mapping[str, FloatArray]) -> Surro
 
 def mechanics_of(sensor: SensorSpec) -> dict[str, Any]:
     """The sections of a specification that decide its mechanics, without the keys that only the optics need."""
-    return _mechanics_of({part: getattr(sensor, part) for part in MECHANICS})
-
-
-def _mechanics_of(sections: Mapping[str, Section]) -> dict[str, Any]:
-    plain = {part: section.model_dump(mode="json") for part, section in sections.items()}
+    plain = {part: getattr(sensor, part).model_dump(mode="json") for part in MECHANICS}
     return {part: {key: value for key, value in plain[part].items() if is_mechanical(part, key)} for part in MECHANICS}
 
 
 def unlike_parts(saved: Mapping[str, Any], sensor: SensorSpec) -> list[str]:
     """Sections in which a surrogate's saved mechanics are not those of a sensor. An earlier version saved more keys with their defaults."""
-    told = _mechanics_of({part: type(getattr(sensor, part)).model_validate(saved[part]) for part in MECHANICS})
-    wanted = mechanics_of(sensor)
+    sections = {part: type(getattr(sensor, part)).model_validate(saved[part]) for part in MECHANICS}
+    told, wanted = mechanics_of(sensor.model_copy(update=sections)), mechanics_of(sensor)
     return [part for part in MECHANICS if told[part] != wanted[part]]
 
 

@@ -152,15 +152,13 @@ class Store:
 
     def _check_config(self) -> None:
         path, text = self.folder / CONFIG, self.config.text()
-        if path.is_file():
-            before, now = read_record(path), json.loads(text)
-            if before != now:
-                other = ", ".join(key for key in {**now, **before} if before.get(key) != now.get(key))
-                raise DatasetError(f"{self.folder}: holds a data set with other settings ({other}); repeat them, or give another `out`")
-            store.require_same_code(self.folder, make_contact, begun=True)
-            return
-        store.require_same_code(self.folder, make_contact, begun=False)
-        write_text(path, text)  # written last, so that a folder with a configuration also states what code made it
+        begun, now = path.is_file(), json.loads(text)
+        if begun and (before := read_record(path)) != now:
+            other = ", ".join(key for key in {**now, **before} if before.get(key) != now.get(key))
+            raise DatasetError(f"{self.folder}: holds a data set with other settings ({other}); repeat them, or give another `out`")
+        store.require_same_code(self.folder, make_contact, begun=begun)
+        if not begun:
+            write_text(path, text)  # written last, so that a folder with a configuration also states what code made it
 
     def _unfinished_error(self, error: StoreError) -> DatasetError:
         done = len(self.list_finished() - {REST})

@@ -345,7 +345,7 @@ def resample_path(drag: Drag, at: np.ndarray, eyes: CapView, rng: np.random.Gene
         return (values[low].T * (1 - part) + values[low + 1].T * part).T
 
     drag_mm, share, limit = between(drag.drag_mm), between(drag.share), drag.whole_mm
-    whole = drag_mm >= limit if np.isfinite(limit) else np.zeros(len(at), bool)
+    whole = drag_mm >= limit  # nowhere if the limit is NaN
     modes = eyes(between(drag.caps_mm), drag.lost[low], rng)
     return DragPath(modes, (share >= BEGINS) | whole, whole, share, np.maximum(limit - drag_mm, 0.0), drag_mm, drag.direction)
 

@@ -178,24 +178,19 @@ class Gcn(nn.Module):
         """
         graphs, nodes = x.shape[:2]
         h = x.reshape(graphs * nodes, -1)
-        for layer, norm in zip(self.convolutions, self.norms, strict=True):
-            h = self._convolve(h, matrix, transpose, cast(nn.Linear, layer).weight, cast(nn.BatchNorm1d, norm))
+        for layer, norm in zip(cast(list[nn.Linear], self.convolutions), cast(list[nn.BatchNorm1d], self.norms), strict=True):
+            running_mean, running_var = cast(torch.Tensor, norm.running_mean), cast(torch.Tensor, norm.running_var)
+            if not self.training:
+                size = norm.weight * (running_var + norm.eps).rsqrt()
+                out = torch.addmm(norm.bias - size * running_mean, matrix @ h, (size[:, None] * layer.weight).T)
+                h = nn.functional.leaky_relu_(out, SLOPE)
+                continue
+            h, mean, variance = GraphConvolution.apply(matrix, transpose, h, layer.weight, norm.weight, norm.bias, norm.eps)
+            with torch.no_grad():
+                momentum = cast(float, norm.momentum)
+                running_mean.lerp_(mean, momentum)
+                running_var.lerp_(variance * (len(h) / max(len(h) - 1, 1)), momentum)
         return {"mean": self.dense(h.view(graphs, nodes, -1).mean(dim=1))}
-
-    def _convolve(
-        self, h: torch.Tensor, matrix: torch.Tensor, transpose: torch.Tensor, weight: torch.Tensor, norm: nn.BatchNorm1d
-    ) -> torch.Tensor:
-        running_mean, running_var = cast(torch.Tensor, norm.running_mean), cast(torch.Tensor, norm.running_var)
-        if not self.training:
-            size = norm.weight * (running_var + norm.eps).rsqrt()
-            out = torch.addmm(norm.bias - size * running_mean, matrix @ h, (size[:, None] * weight).T)
-            return nn.functional.leaky_relu_(out, SLOPE)
-        out, mean, variance = GraphConvolution.apply(matrix, transpose, h, weight, norm.weight, norm.bias, norm.eps)
-        with torch.no_grad():
-            momentum = cast(float, norm.momentum)
-            running_mean.lerp_(mean, momentum)
-            running_var.lerp_(variance * (len(h) / max(len(h) - 1, 1)), momentum)
-        return out
 
 
 class GraphInputs:

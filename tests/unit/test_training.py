@@ -19,8 +19,7 @@ from training.estimate.estimator import PoseEstimator
 from training.estimate.loading import digest_of, models_by_sensor
 from training.models import recipe_of
 from training.models.part import Prediction
-from training.runs.config import training_rows
-from training.runs.identity import changed_since, trained_before
+from training.runs.config import changed_since, trained_before, training_rows
 from training.runs.run import fold_rows, is_finished, train_run
 from training.runs.run_files import folder_of, read_tensors
 from training.studies.evaluation import Evaluation, Predictions

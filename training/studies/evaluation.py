@@ -14,7 +14,7 @@ from training.errors import TrainingError
 from training.estimate.contact_estimator import ContactEstimator, contacts_folder
 from training.estimate.displacements import MOST_CONTACTS, OTHER_UNIT
 from training.estimate.estimator import PoseEstimate, PoseEstimator
-from training.runs.identity import changed_since, trained_before
+from training.runs.config import changed_since, trained_before
 from training.runs.run_files import folder_of
 from training.studies.frame_maps import write_frame_maps
 from training.studies.judging import measure_changes, measure_errors, rows_to_evaluate, time_frames, write_evaluation

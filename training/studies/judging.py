@@ -21,7 +21,7 @@ from training.data.targets import ANGLE, DEPTH, TURN, Targets, limits_of
 from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.models.part import Prediction
-from training.runs.identity import rows_named
+from training.runs.config import rows_named
 from twin.estimate import readable_labels
 from twin.frames import open_recording
 from twin.progress import Step, unheard

@@ -1,6 +1,6 @@
 """The twin's displacements as a smooth function of pose and move.
 
-A displacement is written in waves (``training.models.steered.field``). Where one label is a direction c that goes round the whole circle,
+A displacement is written in waves (``training.models.steered.model``). Where one label is a direction c that goes round the whole circle,
 an edge's, the waves are turned back by c. They are then those that the object's own frame sees, and change little with c. One Gaussian
 process of the labels that vary, of cos c and sin c, and of the moves limited by friction, gives all waves. Its lengths maximise the
 likelihood of the leading components of the waves.
@@ -9,7 +9,7 @@ likelihood of the leading components of the waves.
 import numpy as np
 
 from training.data.audit import LabelColumns
-from training.models.steered.field import waves_of
+from training.models.steered.model import waves_of
 from training.runs.gaussian_process import SMOOTH_AND_LINEAR, Kernel, Points, climb_likelihood
 
 MOST_STATES = 5000

@@ -30,9 +30,8 @@ from training.models import model_named, recipe_of
 from training.models.steered.model import STEERED
 from training.models.vgnn.model import VGNN
 from training.runs.assemble import intervals
-from training.runs.config import RunConfig
+from training.runs.config import RunConfig, frame_marks, identity_of
 from training.runs.gaussian_process import fit_two_fidelities
-from training.runs.identity import frame_marks, identity_of
 from training.runs.run import is_finished, train_run
 from training.runs.run_files import CONFIG, TENSORS, read_tensors, write_tensors
 from training.studies.judging import leak_check, measure_errors

@@ -213,7 +213,11 @@ class Batch:
                 if options.objects is not None or len(self.objects) == 1:
                     raise
                 del self.objects[name]  # of the task's own objects, only those that the backend knows remain
-        self.eye = self._make_eye()
+        noise_px = self.randomisation.pin_noise_px if self.randomisation else 0.0
+        pictures: Pictures = "preview" if options.observation == "image" and options.pictures == "none" else options.pictures
+        self.eye: Eye | None = None
+        if options.observation != "oracle":
+            self.eye = Eye(self.sensor, count, options.observation, pictures=pictures, pin_noise_px=noise_px)
         self._shows = self.eye or Eye(self.sensor, count, "pins", pictures="none", pin_noise_px=0.0)
         self.axes = options.axes or self.task.axes
         self.action_scale = np.array([self.task.largest_deg if axis.startswith("R") else self.task.largest_mm for axis in self.axes])
@@ -413,11 +417,3 @@ class Batch:
             return
         kept = np.where(valid.reshape(-1, *[1] * (newest.ndim - 1)), newest, self._seen[rows, -1])
         self._seen[rows] = np.concatenate([self._seen[rows, 1:], kept[:, None]], axis=1)
-
-    def _make_eye(self) -> Eye | None:
-        options = self.options
-        if options.observation == "oracle":
-            return None
-        noise_px = self.randomisation.pin_noise_px if self.randomisation else 0.0
-        pictures: Pictures = "preview" if options.observation == "image" and options.pictures == "none" else options.pictures
-        return Eye(self.sensor, self.count, options.observation, pictures=pictures, pin_noise_px=noise_px)

@@ -124,7 +124,7 @@ class SteppedTogether(BaselinesVecEnv):
 
     def seen(self, observed: dict[str, Any]) -> FloatArray:
         """See ``BaselinesVecEnv``."""
-        return self.policy.reduce_inputs(*_split_observation(observed))
+        return self.policy.reduce_inputs(observed["tactile"], observed["goal"])
 
 
 class _Watch(BaseCallback):
@@ -219,16 +219,11 @@ def evaluate_policy(policy: Policy, task: str, options: Options, episodes: int, 
     share = np.array([len(range(row, episodes, rows)) for row in range(rows)])
     ended = solved = np.zeros(rows, int)
     while (ended < share).any():
-        seen, _, terminated, truncated, results = vector.step(policy.act(*_split_observation(seen)))
+        seen, _, terminated, truncated, results = vector.step(policy.act(seen["tactile"], seen["goal"]))
         counted = (terminated | truncated) & (ended < share)
         if counted.any():
             ended, solved = ended + counted, solved + (counted & results["final_info"]["is_success"])
     return float(solved.sum() / episodes)
-
-
-def _split_observation(observed: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
-    """The parts of an observation in the form of a policy's input."""
-    return observed["tactile"], observed["goal"]
 
 
 def _untrained_inputs(plan: LearnPlan, vector: TactileVectorEnv) -> Policy:

@@ -1,11 +1,12 @@
-"""Reading specification files: finding them, and errors that name the key and the remedy."""
+"""Reading specification files: finding and listing them, and errors that name the key and the remedy."""
 
 import difflib
 import hashlib
 import os
 import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -163,6 +164,30 @@ def list_specifications(kind: str) -> dict[str, Path]:
     """Names and files of a kind, which is also the name of their folders: a user's own, others', and shipped ones, in this precedence."""
     shipped, own = ({path.stem: path for path in sorted(folder.glob("*.toml"))} for folder in (SHIPPED / kind, user_spec_dir() / kind))
     return shipped | other_files(kind, shipped) | own
+
+
+_LISTED: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
+    "sensors": (load_sensor, lambda spec: f"{spec.pins.count} pins, {spec.camera.channels}"),
+    "objects": (load_object, lambda spec: spec.shape.kind),
+    "experiments": (load_experiment, lambda spec: ", ".join(spec.targets)),
+    "randomisations": (load_randomisation, lambda spec: f"{len(spec.sensor)} numbers of the sensor"),
+}
+"""Of each kind that a command lists: the function that loads a specification, and a detail of it that its line states."""
+
+
+def catalog_lines(kind: str) -> list[str]:
+    """A line for each specification of a kind that a command lists, then the folder of the shipped files, and that for own files."""
+    load, detail = _LISTED[kind]
+    lines, own = [], user_spec_dir() / kind
+    for name, path in list_specifications(kind).items():
+        try:
+            spec = load(name)
+        except SpecError as error:
+            lines.append(f"{name:16} BROKEN: {error}")
+            continue
+        place = "" if path.is_relative_to(SHIPPED) else f"  [{path}]"
+        lines.append(f"{name:16} {spec.description} ({detail(spec)}){place}")
+    return [*lines, "", f"Shipped files: {SHIPPED / kind}", f"Your own: copy one to {own}/NAME.toml and edit it (or give a path: my.toml)"]
 
 
 def _find(name_or_path: object, kind: str) -> Path:

@@ -28,11 +28,9 @@ from twin.signals import end_interrupted, end_on_sigterm
 # Modules of commands, in the order in which 'twin --help' lists them, each with the title above its commands.
 COMMANDS = {
     "start": "Begin",
-    "studio": "Begin",
     "frames": "Frames and pins",
     "calibration": "Your own sensor, and how true its twin is",
     "learning": "Data sets and models",
-    "records": "Data sets and models",
     "studies": "Studies",
     "live": "Cameras and arms",
 }

@@ -41,24 +41,10 @@ def user_spec_dir() -> Path:
     return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "tactip-twin"
 
 
-def list_sensors() -> dict[str, Path]:
-    """Sensor names and their files. A user's own file takes precedence over a shipped one of the same name."""
-    return list_specifications("sensors")
-
-
-def list_objects() -> dict[str, Path]:
-    """Object names and their files. A user's own file takes precedence over a shipped one of the same name."""
-    return list_specifications("objects")
-
-
-def list_experiments() -> dict[str, Path]:
-    """Experiment names and their files. A user's own file takes precedence over a shipped one of the same name."""
-    return list_specifications("experiments")
-
-
-def list_randomisations() -> dict[str, Path]:
-    """Names of randomisations and their files. A user's own file takes precedence over a shipped one of the same name."""
-    return list_specifications("randomisations")
+def list_specifications(kind: str) -> dict[str, Path]:
+    """Names and files of a kind, which is also the name of their folders: a user's own, others', and shipped ones, in this precedence."""
+    shipped, own = ({path.stem: path for path in sorted(folder.glob("*.toml"))} for folder in (SHIPPED / kind, user_spec_dir() / kind))
+    return shipped | other_files(kind, shipped) | own
 
 
 def load_sensor(name_or_path: str | Path | SensorSpec) -> SensorSpec:
@@ -128,7 +114,7 @@ def load_experiment(name_or_path: str | Path | ExperimentSpec, *, wide: bool = F
         There is no such experiment, its file is not valid, or it has no larger ranges. The message names the file, the key and the remedy.
     """
     name = str(name_or_path).removesuffix(OLD_WIDE)
-    known = {} if name == str(name_or_path) else list_experiments()
+    known = {} if name == str(name_or_path) else list_specifications("experiments")
     if name in known and str(name_or_path) not in known:
         warnings.warn(f"experiment '{name_or_path}' is now '{name}' with `wide`", RuntimeWarning, stacklevel=2)
         return load_experiment(name, wide=True)
@@ -158,12 +144,6 @@ def load_servo(name_or_path: str | Path | ServoSpec) -> ServoSpec:
 
 def _load(given: str | Path | Spec, kind: str, model: type[Spec]) -> Spec:
     return given if isinstance(given, model) else read_section(_find(given, kind), model)
-
-
-def list_specifications(kind: str) -> dict[str, Path]:
-    """Names and files of a kind, which is also the name of their folders: a user's own, others', and shipped ones, in this precedence."""
-    shipped, own = ({path.stem: path for path in sorted(folder.glob("*.toml"))} for folder in (SHIPPED / kind, user_spec_dir() / kind))
-    return shipped | other_files(kind, shipped) | own
 
 
 _LISTED: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {

@@ -14,11 +14,10 @@ import pytest
 
 from twin.errors import ContactError, TwinError
 from twin.studio.contact import Light, SolvedMesh
-from twin.studio.page import PORTS_TRIED, StudioPage, free_port
+from twin.studio.page import PORTS_TRIED, StudioPage, free_port, keep_upload
 from twin.studio.pose import NAMES, ObjectPose
 from twin.studio.state import LAST_STATE, MOST_BYTES, StudioState, first_state, read_trajectory, save_trajectory, tap_and_shear
 from twin.studio.tracing import Failed, Traced
-from twin.studio.uploads import keep_upload
 from twin.studio.video import RATE_HZ, FilmWriter
 from twin.studio.worker import Newest, Worker
 

@@ -85,6 +85,13 @@ class FewCommands(TyperGroup):
         return super().resolve_command(ctx, args)
 
 
+def group(name: str, help: str) -> App:
+    """A new group of commands of the program."""
+    made = App(cls=FewCommands, help=help, no_args_is_help=True, rich_markup_mode=None)
+    app.add_typer(made, name=name)
+    return made
+
+
 app = App(name="twin", cls=_Commands, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 
 

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.cli import FewCommands, app, options
-from twin.cli.command import App
+from twin.cli import app, group, options
 from twin.cli.options import Formerly, call, load_if_named, print_lines
 from twin.errors import OptionError
 from twin.progress import Progress
@@ -146,10 +145,7 @@ def new_sensor(
     return call(whole_sensor, locals(), layout=load_if_named(layout_from, layout))
 
 
-calibrate_app = App(
-    cls=FewCommands, help="Fit a sensor's specification to frames of a real one.", no_args_is_help=True, rich_markup_mode=None
-)
-app.add_typer(calibrate_app, name="calibrate")
+calibrate_app = group("calibrate", "Fit a sensor's specification to frames of a real one.")
 
 
 @calibrate_app.command("optics")

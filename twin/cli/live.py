@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.cli import FewCommands, app, options
-from twin.cli.command import App
+from twin.cli import app, group, options
 from twin.cli.options import Formerly, call, print_lines
 from twin.progress import Progress
 from twin.signals import signals_as_ctrl_c
@@ -233,8 +232,8 @@ def servo(
     stream_hz = rate if stream else None
     plan = call(FollowPlan, locals())
     with signals_as_ctrl_c():
-        followed = follow(plan, load_with_history(model), out, about={"model": str(model)}, progress=progress)
-    return followed  # type: ignore[return-value]  # a dry run has nothing but its lines
+        # a dry run has nothing but its lines
+        return follow(plan, load_with_history(model), out, about={"model": str(model)}, progress=progress)  # type: ignore[return-value]
 
 
 @app.command("policy", exit_code=ended_early)
@@ -276,8 +275,8 @@ def run_policy(
 
     plan = call(FollowPlan, locals())
     with signals_as_ctrl_c():
-        followed = follow(plan, load_for_outlines(policy, contacts_of), out, about={"policy": str(policy)}, progress=progress)
-    return followed  # type: ignore[return-value]  # a dry run has nothing but its lines
+        learnt = load_for_outlines(policy, contacts_of)
+        return follow(plan, learnt, out, about={"policy": str(policy)}, progress=progress)  # type: ignore[return-value]  # as above
 
 
 @app.command("grasp")
@@ -325,16 +324,10 @@ def grasp(
 
     plan, decide = call(GripPlan, locals()), GraspPolicy(load_grasp_policy(policy), object_mm)
     with signals_as_ctrl_c():
-        gripped = grip(plan, decide, out, steps=decide.steps, period_s=PERIOD_S, progress=progress)
-    return gripped  # type: ignore[return-value]  # a dry run has nothing but its lines
+        return grip(plan, decide, out, steps=decide.steps, period_s=PERIOD_S, progress=progress)  # type: ignore[return-value]  # as above
 
 
-emulate = App(
-    cls=FewCommands,
-    help="Emulate a device on this machine.\n\nIt prints 'ready ...' when it listens, and runs until SIGTERM or Ctrl-C.",
-    no_args_is_help=True,
-)
-app.add_typer(emulate, name="emulate")
+emulate = group("emulate", "Emulate a device on this machine.\n\nIt prints 'ready ...' when it listens, and runs until SIGTERM or Ctrl-C.")
 
 FaultOption = Annotated[
     list[str] | None, typer.Option("--fault", metavar="NAME[=VALUE]", help="switch a fault on; '--fault help' lists them; may be repeated")

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from twin.cli import FewCommands, app, options
-from twin.cli.command import App
+from twin.cli import group, options
 from twin.cli.options import Formerly, call, each_once, finite, names_in
 from twin.progress import Progress
 from twin.types import FINE
@@ -21,8 +20,7 @@ if TYPE_CHECKING:
     from hardware.servo.following import ServoStudy
     from training.studies import objects, sim_to_real, tac_vgnn
 
-study = App(cls=FewCommands, help="Experiments that compare models.", no_args_is_help=True, rich_markup_mode=None)
-app.add_typer(study, name="study")
+study = group("study", "Experiments that compare models.")
 
 # The objects of the Tac-VGNN paper.
 OBJECTS = "can,mesh-can,square,prism,tin-box"

@@ -29,7 +29,7 @@ from twin.report.skin3d import draw_contact_skin
 from twin.report.table import Column, force_interval, number
 from twin.simulator import RenderedFrame, Simulator
 from twin.store import writes
-from twin.types import ContactState, Form, ReadableResult
+from twin.types import ContactState, Form, ImageArray, ReadableResult
 
 Result = TypeVar("Result")
 
@@ -244,43 +244,46 @@ def write_page(path: Path, page: Page, machine: str, seconds: dict[str, float]) 
 
 def add_contact(page: Page, result: ContactResult, skin: Path) -> None:
     """Add a section about a contact. Its pictures are written beside that of the skin."""
-    look, spec, folder, stem = result.look, result.sensor, skin.parent, f"{result.sensor.name}-{result.obj.name}"
+    look, spec, stem = result.look, result.sensor, f"{result.sensor.name}-{result.obj.name}"
     title = f"{spec.name} against {result.obj.name}"
-    page.section(title, f"{spec.description}. {result.obj.description}, pressed in by {result.pose.indent_mm:g} mm.")
     height, width = result.raw.frame.image.shape[:2]
-    raw = write_image(folder / f"{stem}-frame.png", result.raw.frame.image)
-    shown = [
-        PagePicture(
-            skin, f"{title}: deformed skin in 3D", "The skin, cut open, coloured by its displacement, with pins and object.", "photo"
-        ),
-        PagePicture(raw, f"{title}: rendered camera frame", f"What the camera inside sees ({width} x {height} px).", "frame"),
-    ]
-    if look.frame.form == Form.PROCESSED:
-        recorded = write_image(folder / f"{stem}-recorded.png", look.frame.image)
-        said = "The same frame in the form of this sensor's recordings: cropped, adaptively thresholded, resized."
-        shown.append(PagePicture(recorded, f"{title}: frame in the form of a recording", said, "frame"))
-    page.figures(*shown, layout="row")
     graph, rest = look.graphs()
+
+    def frame(name: str, image: ImageArray, shown: str, said: str) -> PagePicture:
+        return PagePicture(write_image(skin.parent / f"{stem}-{name}.png", image), f"{title}: {shown}", said, "frame")
+
+    def chart(name: str, make: Callable[[], Figure], shown: str, said: str) -> PagePicture:
+        return PagePicture(write_chart(skin.parent / f"{stem}-{name}.png", make), f"{title}: {shown}", said)
+
+    def graph_figure() -> Figure:
+        figure, (ax,) = new_figure(1, panel_inch=6)
+        plots.draw_frame(ax, look.frame.image, around_px=rest.nodes_px)
+        plots.draw_graph(ax, graph)
+        plots.draw_pins(ax, look.observation)
+        return figure
+
+    def areas_figure() -> Figure:
+        figure, (ax,) = new_figure(1, panel_inch=6)
+        plots.draw_area_change(ax, graph, rest.area_px2, "")
+        return figure
+
+    page.section(title, f"{spec.description}. {result.obj.description}, pressed in by {result.pose.indent_mm:g} mm.")
+    said = "The skin, cut open, coloured by its displacement, with pins and object."
+    shown = [PagePicture(skin, f"{title}: deformed skin in 3D", said, "photo")]
+    shown.append(frame("frame", result.raw.frame.image, "rendered camera frame", f"What the camera inside sees ({width} x {height} px)."))
+    if look.frame.form == Form.PROCESSED:
+        said = "The same frame in the form of this sensor's recordings: cropped, adaptively thresholded, resized."
+        shown.append(frame("recorded", look.frame.image, "frame in the form of a recording", said))
+    page.figures(*shown, layout="row")
+    found = "Pins found (green), graph edges (blue) and Voronoi cells (white); yellow crosses are spots that are not pins."
+    change = "Voronoi cell areas against no contact: cells grow where the dome flattens."
+    surfaces = "Cell area interpolated over the image: no contact, contact, difference."
     page.figures(
-        PagePicture(
-            write_chart(folder / f"{stem}-graph.png", lambda: _graph_figure(look)),
-            f"{title}: pins and Voronoi graph",
-            "Pins found (green), graph edges (blue) and Voronoi cells (white); yellow crosses are spots that are not pins.",
-        ),
-        PagePicture(
-            write_chart(folder / f"{stem}-areas.png", lambda: _areas_figure(look)),
-            f"{title}: Voronoi area change",
-            "Voronoi cell areas against no contact: cells grow where the dome flattens.",
-        ),
+        chart("graph", graph_figure, "pins and Voronoi graph", found),
+        chart("areas", areas_figure, "Voronoi area change", change),
         layout="row",
     )
-    page.figures(
-        PagePicture(
-            write_chart(folder / f"{stem}-surfaces.png", lambda: plots.area_surface_figure(rest, graph)),
-            f"{title}: interpolated area surfaces",
-            "Cell area interpolated over the image: no contact, contact, difference.",
-        )
-    )
+    page.figures(chart("surfaces", lambda: plots.area_surface_figure(rest, graph), "interpolated area surfaces", surfaces))
     rows = [{"name": name, "value": value} for name, value in contact_figures(result)]
     page.table(rows, [Column("name", "figure"), Column("value", "value")])
 
@@ -321,19 +324,3 @@ def add_tables(page: Page, tables: Mapping[str, Sequence[DepthRow]]) -> None:
     ]
     for sensor, rows in tables.items():
         page.table([vars(row) for row in rows], columns, caption=sensor)
-
-
-def _graph_figure(look: plots.ObservedFrame) -> Figure:
-    figure, (ax,) = new_figure(1, panel_inch=6)
-    graph, rest = look.graphs()
-    plots.draw_frame(ax, look.frame.image, around_px=rest.nodes_px)
-    plots.draw_graph(ax, graph)
-    plots.draw_pins(ax, look.observation)
-    return figure
-
-
-def _areas_figure(look: plots.ObservedFrame) -> Figure:
-    figure, (ax,) = new_figure(1, panel_inch=6)
-    graph, rest = look.graphs()
-    plots.draw_area_change(ax, graph, rest.area_px2, "")
-    return figure

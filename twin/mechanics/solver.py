@@ -91,7 +91,8 @@ class SkinSolver:
         with self._one_thread():
             setting = self._setting(Focus())
         base, axis, caps = pin_pose(setting.solid, setting.solid.control_mm)
-        return ContactState.undeformed(self.mesh.nodes_mm, base, axis, caps, T_sensor_object=T_sensor_object)
+        pose = np.eye(4) if T_sensor_object is None else T_sensor_object
+        return ContactState(self.mesh.nodes_mm, base, axis, caps, T_sensor_object=pose)
 
     def press(
         self,

@@ -8,14 +8,14 @@ import time
 from collections import deque
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 
-from scenes import list_experiments, load_experiment
+from scenes import list_specifications, load_experiment
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
-from twin.camera.projection import project_in_form
 from twin.errors import ContactError
 from twin.estimate import Estimate, SensorModel, pins_in
 from twin.geometry.solid import Resolution
@@ -88,12 +88,8 @@ class ContactAnswer:
     state : ContactState
     light : (h, w) or (h, w, 3) float
         Linear light of the dome's part of the frame.
-    raw : Frame
-        The whole raw frame.
     frame, seen : Frame, Observation
         The frame in the form that is shown, and the pipeline's observation of it.
-    caps_px : (N, 2) float
-        Positions of the caps in that frame.
     estimate : Estimate or None
         None without a model.
     labels : dict of str to float
@@ -115,10 +111,8 @@ class ContactAnswer:
     indent_mm: float
     state: ContactState
     light: FloatArray
-    raw: Frame
     frame: Frame
     seen: Observation
-    caps_px: FloatArray
     estimate: Estimate | None
     labels: dict[str, float]
     lit: Light
@@ -186,6 +180,7 @@ class MovingContact:
         self.pose = ObjectPose()
         self._last: ContactAnswer | None = None
         self._take_up(setup)
+        self.restart()
         if model is not None:
             self.use(model)
 
@@ -201,31 +196,25 @@ class MovingContact:
         self.model = model
         self._experiment = experiment_of(model)
 
-    def change(self, *, obj: ObjectSpec | None = None, friction: float | None = None, form: Form | None = None) -> None:
-        """Use another object, friction or form of the frames. Arguments that are not given stay as they are. A contact starts again.
+    def change(self, **given: Any) -> None:
+        """Use another ``obj``, ``friction`` or ``form`` of the frames. With another object or friction the contact starts again.
 
         Another object has its own friction until a friction is given again.
+
+        Raises
+        ------
+        FrameError
+            The sensor has no such form.
         """
-        setup = self.setup
-        if obj is not None:
-            setup = replace(setup, obj=obj, friction=None)
-        if friction is not None:
-            setup = replace(setup, friction=friction)
-        if form is not None:
-            setup = replace(setup, form=form)
-        if setup.form is Form.PROCESSED and setup.sensor.recording is None:
-            self.camera.as_recorded(Frame(np.zeros((1, 1), np.uint8), Form.RAW))  # raises the error that there is no such form
-        pressed_anew = setup.obj != self.setup.obj or setup.friction != self.setup.friction
-        if pressed_anew:
-            self._take_up(setup)
-        else:
-            self.setup, self._pipeline = setup, Pipeline(setup.sensor, setup.form)
+        old = self.setup
+        self._take_up(replace(old, **({"friction": None} if "obj" in given else {}) | given))
+        if (old.obj, old.friction) != (self.setup.obj, self.setup.friction):
+            self.restart()
 
     def _take_up(self, setup: ContactSetup) -> None:
+        self._pipeline = Pipeline(setup.sensor, setup.form)
         self._surface, self._field = SmoothSurface(setup.obj), build_field(setup.obj)
         self.setup = setup
-        self._pipeline = Pipeline(setup.sensor, setup.form)
-        self.restart()
 
     def restart(self) -> None:
         """Forget the contact and its friction. The next move presses the object straight down to its pose."""
@@ -417,11 +406,10 @@ class MovingContact:
         of_frame = self.model is not None and self.model.form is self.setup.form
         seen = pins_in(frame, estimate if of_frame else None, self._pipeline)
         times = {"picture": now - started, "estimate": estimated - now, "pins": time.perf_counter() - estimated}
-        true_px = project_in_form(self.setup.sensor, self.setup.form, state.caps_mm)
         labels = self.labels(state.T_sensor_object if len(state.contact_mm) else T)
         self._last = ContactAnswer(
-            self.setup, self._count, self._solved, ObjectPose.of(T, self._apex_mm), -self._follower.gap_mm(T), state, light, raw, frame,
-            seen, true_px, estimate, labels, lit, mesh, arrived, stopped, ms | {name: 1e3 * value for name, value in times.items()},
+            self.setup, self._count, self._solved, ObjectPose.of(T, self._apex_mm), -self._follower.gap_mm(T), state, light, frame, seen,
+            estimate, labels, lit, mesh, arrived, stopped, ms | {name: 1e3 * value for name, value in times.items()},
         )  # fmt: skip
         return self._last
 
@@ -442,7 +430,7 @@ def experiment_of(model: SensorModel) -> ExperimentSpec | None:
     Its axes and its zero define the labels.
     """
     names = set(getattr(model, "names", ()))
-    for name in sorted(list_experiments()):
+    for name in sorted(list_specifications("experiments")):
         experiment = load_experiment(name)
         if set(experiment.targets) == names and experiment.object == "plane":
             return experiment

@@ -142,10 +142,7 @@ class Tracer:
 
     def outcomes(self) -> list[Outcome]:
         """Outcomes that have arrived since the last call; never waits."""
-        found: list[Outcome] = []
-        while self._found:
-            found.append(self._found.popleft())
-        return found
+        return [self._found.popleft() for _ in range(len(self._found))]
 
     def _receive(self) -> None:
         """Receive outcomes as they arrive. A process that waits to send does not read the next job, so both sides would wait forever."""
@@ -251,9 +248,7 @@ class _Maker:
 def _catch_render_errors(make: Callable[[], Iterator[Outcome]], *, tracing: bool = False) -> Iterator[Outcome]:
     try:
         yield from make()
-    except RenderError as error:
-        yield Failed(str(error), tracing)
     except TwinError as error:
-        yield Failed(str(error))
+        yield Failed(str(error), tracing and isinstance(error, RenderError))
     except (RuntimeError, OSError, ValueError) as error:  # raised by Mitsuba and LLVM, and if the disk is full
         yield Failed(f"{type(error).__name__}: {error}", tracing)

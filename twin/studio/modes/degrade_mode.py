@@ -111,16 +111,13 @@ class DegradeMode(PageMode):
         conditions = selectable_conditions()
         titles = (NO_CONDITION, *conditions)
         by_name = {c.name: title for title, c in conditions.items()}
-        self._conditions, self._choices, self._severities = conditions, [], []
+        self._conditions, self._controls = conditions, []
         with self.folder:
             for k in range(SLIDERS):
                 first = by_name.get(FIRST[k], NO_CONDITION)
-                choice = page.gui.add_dropdown(f"condition {k + 1}", titles, initial_value=first)
+                choice = page.watch(page.gui.add_dropdown(f"condition {k + 1}", titles, initial_value=first), self._restart)
                 slider = page.gui.add_slider(f"severity {k + 1}", 0.0, 1.0, 0.01, 0.0, hint="1: unusable")
-                for control in (choice, slider):
-                    control.on_update(lambda event: self._restart())
-                self._choices.append(choice)
-                self._severities.append(slider)
+                self._controls.append((choice, page.watch(slider, self._restart)))
             page.button("Find breaking point", self._find, hint="raise the severity of condition 1 until something fails; others are kept")
             page.button("Reset", self._reset)
 
@@ -145,13 +142,13 @@ class DegradeMode(PageMode):
         self._wanted.give(None)
 
     def _reset(self) -> None:
-        for slider in self._severities:
+        for _, slider in self._controls:
             put(slider, 0.0)
         self._restart()
 
     def cases(self) -> list[tuple[DegradedCase, float]]:
         """The chosen conditions with their severities."""
-        chosen = [(choice.value, float(slider.value)) for choice, slider in zip(self._choices, self._severities, strict=True)]
+        chosen = [(choice.value, float(slider.value)) for choice, slider in self._controls]
         return [(DegradedCase((condition(self._conditions[title].name),)), severity) for title, severity in chosen if title != NO_CONDITION]
 
     def _show(self, _: None) -> None:

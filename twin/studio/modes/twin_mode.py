@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import viser
 
-from scenes import list_objects, list_sensors, load_object, load_sensor
+from scenes import list_specifications, load_object, load_sensor
 from scenes.base import SpecError
 from twin.errors import TwinError
 from twin.estimate import SensorModel, readable_labels
@@ -83,7 +83,7 @@ class TwinMode(PageMode):
         self._out, self._model_of, self._traces = out, model_of, traces
         self._state = state
         self._kept: StudioState | None = None  # as it is in the file of the last state
-        self._shown, self._drawn = PinColour(state.colour), OverlayChoices(state.drawn)
+        self._shown, self._drawn = state.colour, state.drawn
         self._wish, self._wished_s = state.object_pose(), 0.0
         self._undo: list[ObjectPose] = []
         self.model_note, self._loading = MODEL_LOADING, False
@@ -107,7 +107,7 @@ class TwinMode(PageMode):
     def _prepare(self, state: StudioState) -> tuple[MovingContact, Tracer | None]:
         """The contact of a state and its tracer. The page is not changed."""
         sensor = load_sensor(state.sensor)
-        contact = MovingContact(ContactSetup(sensor, load_object(state.object), state.friction, Form(state.form)))
+        contact = MovingContact(ContactSetup(sensor, load_object(state.object), state.friction, state.form))
         return contact, Tracer(sensor) if self._traces else None
 
     def _take_up(self, contact: MovingContact, tracer: Tracer | None) -> None:
@@ -169,9 +169,9 @@ class TwinMode(PageMode):
         return self._state.alter(
             friction=self.contact.setup.friction,
             pose=asdict(self._wish),
-            form=str(self.contact.setup.form),
-            colour=str(self._shown),
-            drawn=str(self._drawn),
+            form=self.contact.setup.form,
+            colour=self._shown,
+            drawn=self._drawn,
         )
 
     # wishes
@@ -215,59 +215,48 @@ class TwinMode(PageMode):
     # controls
 
     def _build_controls(self) -> None:
-        gui, guarded, button, setup = self._page.gui, self._page.guard, self._page.button, self.contact.setup
+        gui, guarded, watch, button = self._page.gui, self._page.guard, self._page.watch, self._page.button
+
+        def choice(label: str, choices: Iterable[str], chosen: str, take: Callable[[], None]) -> viser.GuiDropdownHandle[str]:
+            return watch(gui.add_dropdown(label, tuple(map(str, choices)), initial_value=str(chosen)), take)
+
         with self.folder:
             self._sliders = {}
             for name in NAMES:
                 low, high, why = LIMITS[name]
-                self._sliders[name] = slider = gui.add_slider(
-                    f"{readable_name(name)}, {unit_of(name)}",
-                    low,
-                    high,
-                    0.05,
-                    getattr(self._wish, name),
-                    hint=f"{low:g} to {high:g}: {why}",
-                )
-                slider.on_update(guarded(partial(self._move_to_slider, name)))
+                title, hint = f"{readable_name(name)}, {unit_of(name)}", f"{low:g} to {high:g}: {why}"
+                slider = gui.add_slider(title, low, high, 0.05, getattr(self._wish, name), hint=hint)
+                self._sliders[name] = watch(slider, partial(self._move_to_slider, name))
             with gui.add_folder("Contact"):
-                sensors, objects = (tuple(sorted({*names(), chosen})) for names, chosen in (
-                    (list_sensors, self._state.sensor), (list_objects, self._state.object)))  # fmt: skip
-                self._sensor = gui.add_dropdown("sensor", sensors, initial_value=self._state.sensor)
-                self._object = gui.add_dropdown("object", objects, initial_value=self._state.object)
+                sensor, touched = self._state.sensor, self._state.object
+                self._sensor = choice("sensor", sorted({*list_specifications("sensors"), sensor}), sensor, self._change_sensor)
+                self._object = choice("object", sorted({*list_specifications("objects"), touched}), touched, self._change_object)
                 self._page.upload(
                     "Upload an object (mesh)", ".stl,.obj,.ply", self._touch, hint="lengths in mm; or drop the file on the page"
                 )
-                self._friction = gui.add_slider("friction", 0.0, MOST_FRICTION, 0.01, self._own_friction())
+                self._friction = watch(gui.add_slider("friction", 0.0, MOST_FRICTION, 0.01, self._own_friction()), self._change_friction)
                 button("Restart contact", self.restart_contact, hint="clear the friction history and press straight down")
             with gui.add_folder("Show"):
-                forms = tuple(str(form) for form in Form if form is Form.RAW or setup.sensor.recording is not None)
-                self._form = gui.add_dropdown("frame", forms, initial_value=str(setup.form))
-                self._drawing = gui.add_dropdown("overlay", tuple(map(str, OverlayChoices)), initial_value=str(self._drawn))
-                self._colour = gui.add_dropdown("colour pins by", tuple(map(str, PinColour)), initial_value=str(self._shown))
+                self._form = choice("frame", self._forms(), self.contact.setup.form, self._change_form)
+                self._drawing = choice("overlay", OverlayChoices, self._drawn, self._change_look)
+                self._colour = choice("colour pins by", PinColour, self._shown, self._change_look)
             with gui.add_folder("Move", expand_by_default=False):
                 button("Tap and shear", self.tap_and_shear)
                 upload = gui.add_upload_button("Play trajectory (CSV)", mime_type=".csv", hint="columns time_s, x_mm, y_mm, depth_mm, ...")
-                self._record_way = gui.add_checkbox("record the trajectory", False)
+                self._record_way = watch(gui.add_checkbox("record the trajectory", False), self._toggle_trajectory)
                 button("Undo", self.undo)
             with gui.add_folder("Save", expand_by_default=False):
                 button("Save picture", self.save_picture)
                 button("Save contact files", self.save_contact)
                 button("Save state", self.save_state)
                 opened = gui.add_upload_button("Open a state", mime_type=".json")
-                link = self.state.link(self._page.url)
-                self._link = gui.add_text("link", link, hint="opens this state again; paste another one to open it")
-                self._filming = gui.add_checkbox("record a video", False)
-        self._form.on_update(guarded(self._change_form))
-        self._drawing.on_update(guarded(self._change_look))
-        self._colour.on_update(guarded(self._change_look))
-        self._friction.on_update(guarded(self._change_friction))
-        self._object.on_update(guarded(self._change_object))
-        self._sensor.on_update(guarded(self._change_sensor))
+                self._link = gui.add_text(
+                    "link", self.state.link(self._page.url), hint="opens this state again; paste another one to open it"
+                )
+                self._filming = watch(gui.add_checkbox("record a video", False), self._toggle_film)
         upload.on_upload(guarded(lambda: self.play(read_trajectory(upload.value.content, upload.value.name))))
         opened.on_upload(guarded(lambda: self.open(StudioState.read(opened.value.content, opened.value.name))))
-        self._link.on_update(guarded(lambda: self._links.give(self._link.value)))
-        self._record_way.on_update(guarded(self._toggle_trajectory))
-        self._filming.on_update(guarded(self._toggle_film))
+        watch(self._link, lambda: self._links.give(self._link.value))
         for modifier, names in CHANGED.items():
             for keys, name in zip(KEYS, names, strict=True):
                 for key, sign in zip(keys, (-1, +1), strict=True):
@@ -276,6 +265,10 @@ class TwinMode(PageMode):
                     command.on_trigger(guarded(partial(self.nudge, name, sign)))
         gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(guarded(self.undo))
         gui.add_command("Tap and shear", hotkey="T", modifier="shift").on_trigger(guarded(self.tap_and_shear))
+
+    def _forms(self) -> tuple[str, ...]:
+        """The forms of the sensor's frames."""
+        return tuple(str(form) for form in Form if form is Form.RAW or self.contact.setup.sensor.recording is not None)
 
     def _move_to_slider(self, name: str) -> None:
         self.ask(replace(self._wish, **{name: float(self._sliders[name].value)}))
@@ -344,7 +337,7 @@ class TwinMode(PageMode):
         chosen = self._sensor.value
         with self._rebuilding:
             try:
-                self.open(self.state.alter(sensor=chosen, form=str(Form.RAW)), as_deep=True)
+                self.open(self.state.alter(sensor=chosen, form=Form.RAW), as_deep=True)
             except (TwinError, SpecError):
                 put(self._sensor, self._state.sensor, send=True)
                 raise
@@ -373,11 +366,10 @@ class TwinMode(PageMode):
             before, friction = self._choices(), self._own_friction()
             self._state, wish = state, self._wish
             self._wish = _as_deep(wish, self.contact.touch_mm(wish), prepared[0]) if as_deep else state.object_pose()
-            self._shown, self._drawn = PinColour(state.colour), OverlayChoices(state.drawn)
+            self._shown, self._drawn = state.colour, state.drawn
             self.model_note = MODEL_LOADING
             self._take_up(*prepared)
-            setup = self.contact.setup
-            self._form.options = tuple(str(form) for form in Form if form is Form.RAW or setup.sensor.recording is not None)
+            self._form.options = self._forms()
             for control, name in ((self._sensor, state.sensor), (self._object, state.object)):
                 control.options = tuple(sorted({*control.options, name}))
             for (control, old), (_, new) in zip(before, self._choices(), strict=True):

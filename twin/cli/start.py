@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Option
 
 from twin.cli import app, options
 from twin.cli.options import call, print_lines
@@ -85,9 +85,7 @@ def randomisations() -> None:
 
 @app.command("doctor", exit_code=lambda machine: 0 if machine.can_render else 1)
 def doctor(
-    prepare: Annotated[bool, typer.Option("--prepare", help="first compile what commands need at their first use")] = False,
-    *,
-    progress: Progress,
+    prepare: Annotated[bool, Option("--prepare", help="first compile what commands need at their first use")] = False, *, progress: Progress
 ) -> "Machine":
     """Check this machine, and list what is missing, with the remedy.
 
@@ -127,15 +125,15 @@ def demo(out: options.Out = Path("out/demo"), *, progress: Progress) -> "Demo":
 def render_contact_command(
     sensor: options.Sensor,
     obj: options.Object,
-    indent_mm: Annotated[float, typer.Option(metavar="D", help="indentation from first touch; 0: no contact")],
+    indent_mm: Annotated[float, Option(metavar="D", help="indentation from first touch; 0: no contact")],
     out: options.Out,
-    tilt_deg: Annotated[options.Pair, typer.Option(metavar="RX RY", help="turn of the object about x, then y")] = (0.0, 0.0),
-    shear_mm: Annotated[options.Pair, typer.Option(metavar="X Y", help="drag after the press")] = (0.0, 0.0),
-    twist_deg: Annotated[float, typer.Option(metavar="RZ", help="turn about z during the drag")] = 0.0,
-    offset_mm: Annotated[options.Pair, typer.Option(metavar="X Y", help="sideways shift of the object before it approaches")] = (0.0, 0.0),
-    form: Annotated[Form, typer.Option(help="the camera's frame, or the cropped and thresholded form of the recordings")] = Form.RAW,
-    quality: Annotated[Quality, typer.Option(help=options.QUALITY)] = "standard",
-    seed: Annotated[int, typer.Option(min=0, help="seed of the renderer and of the camera's noise")] = 0,
+    tilt_deg: Annotated[options.Pair, Option(metavar="RX RY", help="turn of the object about x, then y")] = (0.0, 0.0),
+    shear_mm: Annotated[options.Pair, Option(metavar="X Y", help="drag after the press")] = (0.0, 0.0),
+    twist_deg: Annotated[float, Option(metavar="RZ", help="turn about z during the drag")] = 0.0,
+    offset_mm: Annotated[options.Pair, Option(metavar="X Y", help="sideways shift of the object before it approaches")] = (0.0, 0.0),
+    form: Annotated[Form, Option(help="the camera's frame, or the cropped and thresholded form of the recordings")] = Form.RAW,
+    quality: Annotated[Quality, Option(help=options.QUALITY)] = "standard",
+    seed: Annotated[int, Option(min=0, help="seed of the renderer and of the camera's noise")] = 0,
     *,
     progress: Progress,
 ) -> "RenderedContact":
@@ -192,23 +190,23 @@ def render_contact_command(
 @app.command("studio")
 def studio(
     sensor: Annotated[
-        str | None, typer.Option(metavar="S", help="sensor name ('twin sensors') or specification file (mg400-331 if not given)")
+        str | None, Option(metavar="S", help="sensor name ('twin sensors') or specification file (mg400-331 if not given)")
     ] = None,
     obj: Annotated[
-        str | None, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file (sphere)")
+        str | None, Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file (sphere)")
     ] = None,
     state: Annotated[
-        str | None, typer.Option(metavar="FILE", help="a state saved by the page, or its link, instead of sensor and object")
+        str | None, Option(metavar="FILE", help="a state saved by the page, or its link, instead of sensor and object")
     ] = None,
-    model: Annotated[Path | None, typer.Option(metavar="RUN", help="folder of a run for its sensor; shipped weights if not given")] = None,
-    recording: Annotated[str, typer.Option(metavar="DIR", help="recording for the mode 'Recording'")] = "",
-    camera: Annotated[str, typer.Option(metavar="C", help="camera for the mode 'Live', as 'twin live' takes it")] = "",
-    arm: Annotated[str, typer.Option(metavar="A", help="arm for the mode 'Live'; it does not move until you arm it on the page")] = "",
-    saves: Annotated[Path, typer.Option(metavar="DIR", help="folder for files that the page saves")] = Path("out/studio"),
-    host: Annotated[str, typer.Option(help="address to listen on; a warning if other machines can reach it")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=1, max=65535, help="port of the page; the next free one if it is taken")] = 8090,
-    plain: Annotated[bool, typer.Option("--plain", help="no path tracing: pictures stay rasterised")] = False,
-    seconds: Annotated[float | None, typer.Option(min=0, help="end after this time")] = None,
+    model: Annotated[Path | None, Option(metavar="RUN", help="folder of a run for its sensor; shipped weights if not given")] = None,
+    recording: Annotated[str, Option(metavar="DIR", help="recording for the mode 'Recording'")] = "",
+    camera: Annotated[str, Option(metavar="C", help="camera for the mode 'Live', as 'twin live' takes it")] = "",
+    arm: Annotated[str, Option(metavar="A", help="arm for the mode 'Live'; it does not move until you arm it on the page")] = "",
+    saves: Annotated[Path, Option(metavar="DIR", help="folder for files that the page saves")] = Path("out/studio"),
+    host: Annotated[str, Option(help="address to listen on; a warning if other machines can reach it")] = "127.0.0.1",
+    port: Annotated[int, Option(min=1, max=65535, help="port of the page; the next free one if it is taken")] = 8090,
+    plain: Annotated[bool, Option("--plain", help="no path tracing: pictures stay rasterised")] = False,
+    seconds: Annotated[float | None, Option(min=0, help="end after this time")] = None,
 ) -> None:
     """Move an object over the skin, on a page in the browser.
 

@@ -1,7 +1,7 @@
 """Frozen types of the data between the stages, with their shapes and units."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeAlias
@@ -219,6 +219,14 @@ class ContactState:
     def slip_share(self) -> float:
         """Fraction of the pressed area that slips, 0 to 1; 0 without contact."""
         return float(self.point_area_mm2[self.slipping].sum() / max(self.point_area_mm2.sum(), 1e-9))
+
+    @classmethod
+    def undeformed(
+        cls, nodes_mm: FloatArray, base_mm: FloatArray, axis: FloatArray, caps_mm: FloatArray, *, T_sensor_object: FloatArray | None = None
+    ) -> "ContactState":
+        """The state of the undeformed sensor without contact."""
+        state = cls(nodes_mm, base_mm, axis, caps_mm)
+        return state if T_sensor_object is None else replace(state, T_sensor_object=T_sensor_object)
 
 
 @dataclass(frozen=True)

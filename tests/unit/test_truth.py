@@ -9,7 +9,7 @@ from twin.types import ContactState, Form
 
 
 def state_at(base, axis, caps):
-    return ContactState(np.zeros((0, 3)), base, axis, caps)
+    return ContactState.undeformed(np.zeros((0, 3)), base, axis, caps)
 
 
 def rest_state(spec):

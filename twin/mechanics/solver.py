@@ -91,8 +91,7 @@ class SkinSolver:
         with self._one_thread():
             setting = self._setting(Focus())
         base, axis, caps = pin_pose(setting.solid, setting.solid.control_mm)
-        pose = np.eye(4) if T_sensor_object is None else T_sensor_object
-        return ContactState(self.mesh.nodes_mm, base, axis, caps, T_sensor_object=pose)
+        return ContactState.undeformed(self.mesh.nodes_mm, base, axis, caps, T_sensor_object=T_sensor_object)
 
     def press(
         self,

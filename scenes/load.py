@@ -74,21 +74,16 @@ def load_object(name_or_path: str | Path | ObjectSpec) -> ObjectSpec:
             raise SpecError(f"{quote(path, LONGEST_PATH)}: no such mesh file; give the path of an existing STL, OBJ or PLY")
         mesh = MeshShape(kind="mesh", file=str(path.resolve()), sha256=_digest(path))
         return _validate({"name": path.stem, "description": f"mesh {path.name}", "shape": mesh}, path, ObjectSpec)
-    spec_path = _find(name_or_path, "objects")
-    spec = read_section(spec_path, ObjectSpec)
+    place = _find(name_or_path, "objects")
+    spec = read_section(place, ObjectSpec)
     if isinstance(spec.shape, MeshShape):
-        file = spec_path.parent / spec.shape.file
+        file = place.parent / spec.shape.file
         if not os.path.isfile(file):
-            raise SpecError(
-                f"{spec_path}: shape.file: no such mesh file '{quote(spec.shape.file)}'; the path is relative to the specification"
-            )
+            raise SpecError(f"{place}: shape.file: no such mesh file '{quote(spec.shape.file)}'; the path is relative to the specification")
         digest = _digest(file)
         if spec.shape.sha256 not in ("", digest):
-            raise SpecError(
-                f"{spec_path}: shape.sha256: {file} has another content ({digest}); put the right file there, or leave the key out"
-            )
-        found = {"file": str(file.resolve()), "sha256": digest}
-        spec = spec.alter(shape=found)
+            raise SpecError(f"{place}: shape.sha256: {file} has another content ({digest}); put the right file there, or leave the key out")
+        spec = spec.alter(shape={"file": str(file.resolve()), "sha256": digest})
     return spec
 
 
@@ -180,9 +175,7 @@ def _find(name_or_path: object, kind: str) -> Path:
         raise SpecError(f"{path}: files ending in '{path.suffix}' are not understood here; give one of {suffixes}")
     if path.suffix == ".toml":
         if not os.path.isfile(path):
-            raise SpecError(
-                f"{quote(path, LONGEST_PATH)}: no such file; give the path of an existing TOML specification, or a name ({listed})"
-            )
+            raise SpecError(f"{quote(path, LONGEST_PATH)}: no such file; give the path of a TOML specification, or a name ({listed})")
         return path
     if str(name_or_path) in known:
         return known[str(name_or_path)]

@@ -155,10 +155,8 @@ class PolicyModel:
     counts_from_rest = True
 
     def __init__(self, policy: Policy, *, goal: FloatArray | None = None, contacts: KnownContacts | None = None) -> None:
-        if policy.about["observation"] != "pins":
-            raise PolicyError(
-                f"a policy that sees {policy.about['observation']!r} can't be run on frames; train one with observation 'pins'"
-            )
+        if (seen := policy.about["observation"]) != "pins":
+            raise PolicyError(f"a policy that sees {seen!r} can't be run on frames; train one with observation 'pins'")
         self.policy, self.contacts = policy, contacts
         self.sensor = SensorSpec.model_validate(policy.about["sensor"])
         self.form = Form.PROCESSED if self.sensor.recording else Form.RAW
@@ -189,9 +187,8 @@ class PolicyModel:
     def check(self, sensor: SensorSpec, form: Form) -> None:
         """Raise ``FrameError`` for frames of another sensor or form."""
         if sensor.name != self.sensor.name or form != self.form:
-            raise FrameError(
-                f"the policy was trained for {self.form} frames of '{self.sensor.name}'; these are {form} frames of '{sensor.name}'"
-            )
+            own = f"{self.form} frames of '{self.sensor.name}'"
+            raise FrameError(f"the policy was trained for {own}; these are {form} frames of '{sensor.name}'")
 
     def __call__(self, frame: Frame) -> PolicyAction:
         """The action for a frame. It is not valid if too few pins are found, or if they show a contact that the policy does not know."""

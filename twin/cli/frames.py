@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from twin.pins.detectors.tune_files import TunedOnFrames
     from twin.pins.graph_files import Graphs
 
+Method = Literal["twin", "legacy", "adaptive", "fixed", "simple", "log", "dog", "doh"]
+
 
 @app.command("preprocess")
 def preprocess(
@@ -118,9 +120,7 @@ def tune(
     sensor: options.Sensor,
     frames: Annotated[Path, Option(metavar="DIR", help="folder of frames, video or recording")],
     out: Annotated[Path | None, Option(metavar="FILE.toml", help="the file to write")] = None,
-    method: Annotated[
-        Literal["twin", "legacy", "adaptive", "fixed", "simple", "log", "dog", "doh"], Option(help="method to tune")
-    ] = "twin",
+    method: Annotated[Method, Option(help="method to tune")] = "twin",
     form: options.FormOrAuto = None,
     max_frames: options.MaxFrames = 12,
     table: options.Table = None,

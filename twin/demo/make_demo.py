@@ -189,10 +189,9 @@ def run_demo(out: Path, *, progress: Progress = silent) -> Demo:
     add_tables(page, tables)
 
     renderer = simulators[motion_sensor].describe()["renderer"]
-    machine = f"Rendered with Mitsuba variant {renderer['variant']} on {os.cpu_count()} cores ({platform.machine()}). " + " ".join(
-        sorted(notes)
-    )
-    return Demo(tables, [write_page(out / "index.html", page, machine, seconds), *sorted(pictures.iterdir())])
+    machine = f"Rendered with Mitsuba variant {renderer['variant']} on {os.cpu_count()} cores ({platform.machine()})."
+    written = write_page(out / "index.html", page, " ".join([machine, *sorted(notes)]), seconds)
+    return Demo(tables, [written, *sorted(pictures.iterdir())])
 
 
 def motion_figure(motions: list[tuple[str, plots.ObservedFrame]]) -> Figure:
@@ -235,9 +234,7 @@ def write_page(path: Path, page: Page, machine: str, seconds: dict[str, float]) 
     page.section("Time")
     stages = [{"stage": name, "seconds": value} for name, value in (seconds | {"all": sum(seconds.values())}).items()]
     page.table(stages, [Column("stage", "stage"), Column("seconds", "time", "s", decimals=2)])
-    page.section(
-        "What to try next", "The tutorials in docs/tutorials go through each of these; 'make docs' builds the whole documentation."
-    )
+    page.section("What to try next", "The tutorials in docs/tutorials go through each of these; 'make docs' builds all documents.")
     page.items([sentence(code(command) + ":", what + ".") for command, what in NEXT])
     return page.write(path, embed=True)
 

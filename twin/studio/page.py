@@ -60,8 +60,8 @@ CHART_PX = 170
 """Height of a chart, px."""
 LINES = ("#4dabf7", "#ff922b", "#51cf66", "#f06595", "#ffd43b", "#845ef7")
 """Colours of a chart's lines."""
-MOST_UNPACKED = 4_000_000_000
-"""Largest size of the content of an uploaded archive, bytes."""
+MOST_UNPACKED_GB = 4
+"""Largest size of the content of an uploaded archive."""
 CHANGE_S = 10.0
 """Longest wait, s, for changes of the page."""
 
@@ -191,10 +191,8 @@ def keep_upload(folder: Path, name: str, content: bytes) -> Path:
             return place / safe
         try:
             with ZipFile(BytesIO(content)) as archive:
-                if sum(each.file_size for each in archive.infolist()) > MOST_UNPACKED:
-                    raise TwinError(
-                        f"{safe}: more than {MOST_UNPACKED / 1e9:g} GB unpacked; give the folder's path on the studio's machine"
-                    )
+                if sum(each.file_size for each in archive.infolist()) > 1e9 * MOST_UNPACKED_GB:
+                    raise TwinError(f"{safe}: more than {MOST_UNPACKED_GB} GB unpacked; give the folder's path on the studio's machine")
                 archive.extractall(place)  # never writes outside of the folder
         except (BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
             raise TwinError(f"{safe}: no readable archive ({error}); upload a .zip of a folder of frames") from error
@@ -245,9 +243,7 @@ class LineChart:
     def _draw_anew(self) -> None:
         if self._plot is not None:
             self._plot.remove()
-        lines: list[uplot.Series] = [
-            {"label": name, "stroke": colour, "width": 2} for name, colour in zip(self._names, LINES, strict=False)
-        ]
+        lines: list[uplot.Series] = [{"label": name, "stroke": rgb, "width": 2} for name, rgb in zip(self._names, LINES, strict=False)]
         faint: uplot.Axis_Grid = {"stroke": "#8a93a333", "width": 1}
         axis: uplot.Axis = {"stroke": "#8a93a3", "size": 50, "grid": faint, "ticks": {**faint, "size": 4}}
         with self._page.charts_tab:
@@ -425,6 +421,10 @@ class StudioPage:
         """Add a button for a file of some kinds (".stl,.obj"); ``take`` is called with the path at which it is stored."""
         button = self.gui.add_upload_button(label, mime_type=kinds, hint=hint)
         button.on_upload(self.guard(lambda: take(str(keep_upload(self._saves, button.value.name, button.value.content)))))
+
+    def upload_frames(self, take: Callable[[str], object]) -> None:
+        """Add a button for frames, as ``upload`` does; an archive is unpacked."""
+        self.upload("Upload frames (zip or video)", ARCHIVES, take, hint="or drop a folder, an archive or a video on the page")
 
     def say(self, text: str, *, bad: bool = False) -> None:
         """Show a message for some seconds."""

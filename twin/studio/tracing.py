@@ -160,9 +160,8 @@ class Tracer:
         except (EOFError, OSError, TypeError):  # this end of the connection, or the other, was closed
             if not self._ended:
                 self._ended = True
-                self._found.append(
-                    Failed("the path tracer's process has ended; pictures stay rasterised. Start the studio again", tracing=True)
-                )
+                why = "the path tracer's process has ended; pictures stay rasterised. Start the studio again"
+                self._found.append(Failed(why, tracing=True))
 
     def __enter__(self) -> "Tracer":
         return self

@@ -112,19 +112,15 @@ class EpisodeMode(PageMode):
         way_mm = np.linalg.norm(step.pins.caps_mm - self._rest.caps_mm, axis=1)
 
         def scene() -> None:
-            self._scene.show_pins(
-                step.pins, self._skin.vertices(step.pins.base_mm).astype(np.float32), colours(way_mm, PinColour.DISPLACEMENT)
-            )
+            skin_mm = self._skin.vertices(step.pins.base_mm).astype(np.float32)
+            self._scene.show_pins(step.pins, skin_mm, colours(way_mm, PinColour.DISPLACEMENT))
             self._scene.show_object(step.T_sensor_object)
             self._scene.show_force(step.foot_mm, step.force_n)
             self._rewards.add({"reward": step.reward})
             self._forces.add(dict(zip("xyz", step.force_n.tolist(), strict=True)))
 
-        numbers = [
-            f"<span data-number='{step.number}' data-depth='0'></span>",
-            badge("episode", "moving"),
-            number_table(rows | step.description),
-        ]
+        mark = f"<span data-number='{step.number}' data-depth='0'></span>"
+        numbers = [mark, badge("episode", "moving"), number_table(rows | step.description)]
         pictures = frame_pictures(self._sensor, self._reference, step.frame, seen)
         self.put_up(pictures, f"camera, {step.frame.form} frame", numbers, also=scene)
 

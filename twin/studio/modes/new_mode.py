@@ -14,7 +14,7 @@ from twin.frames import Recording, frames_at, open_recording
 from twin.pins.pipeline import Pipeline
 from twin.studio.modes.mode import PageMode
 from twin.studio.modes.twin_mode import TwinMode
-from twin.studio.page import ARCHIVES, StudioPage, put
+from twin.studio.page import StudioPage, put
 from twin.studio.pictures import CONTROLS, OverlayChoices, badge, camera_picture, cell_picture, number_table, paragraph
 from twin.studio.state import FIRST_DEPTH_MM, next_path
 from twin.types import Form
@@ -54,9 +54,7 @@ class NewMode(PageMode):
         gui = page.gui
         with self.folder:
             self._frames = gui.add_text("frames", "", hint="folder, video or recording on the studio's machine")
-            page.upload(
-                "Upload frames (zip or video)", ARCHIVES, self._take_upload, hint="or drop a folder, an archive or a video on the page"
-            )
+            page.upload_frames(self._take_upload)
             self._no_contact = gui.add_text("no-contact frame", "", hint="a picture without contact; may be empty")
             self._layout = gui.add_text("layout", "", hint="empty: identified; or rings:10, hexagon:6, grid:9x7, positions:FILE.csv")
             self._radius = gui.add_text(

@@ -19,7 +19,7 @@ from twin.studio.contact import MovingContact, experiment_of
 from twin.studio.live_page import frame_pictures
 from twin.studio.modes.mode import PageMode
 from twin.studio.modes.twin_mode import TwinMode
-from twin.studio.page import ARCHIVES, CELLS, StudioPage, put
+from twin.studio.page import CELLS, StudioPage, put
 from twin.studio.pictures import badge, estimate_table, number_table, paragraph
 from twin.types import Form, Frame, ImageArray, Observation
 
@@ -175,9 +175,7 @@ class RecordingMode(PageMode):
         with self.folder:
             self._path = gui.add_text("folder or video", first, hint="any recording that 'twin preprocess' reads, on the studio's machine")
             page.button("Open", lambda: self.open(self._path.value))
-            page.upload(
-                "Upload frames (zip or video)", ARCHIVES, self._take_upload, hint="or drop a folder, an archive or a video on the page"
-            )
+            page.upload_frames(self._take_upload)
             self._number = page.watch(gui.add_slider("frame number", 0, 1, 1, 0, disabled=True), lambda: self._go(int(self._number.value)))
             steps = gui.add_button_group("step", ("-10", "-1", "+1", "+10"))
             page.button("Next doubtful label", lambda: self._wanted.give(-1), hint="the next frame whose label is doubtful")

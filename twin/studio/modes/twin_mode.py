@@ -215,7 +215,7 @@ class TwinMode(PageMode):
     # controls
 
     def _build_controls(self) -> None:
-        gui, guarded, watch, button = self._page.gui, self._page.guard, self._page.watch, self._page.button
+        page, gui, watch, button = self._page, self._page.gui, self._page.watch, self._page.button
 
         def choice(label: str, choices: Iterable[str], chosen: str, take: Callable[[], None]) -> viser.GuiDropdownHandle[str]:
             return watch(gui.add_dropdown(label, tuple(map(str, choices)), initial_value=str(chosen)), take)
@@ -231,9 +231,7 @@ class TwinMode(PageMode):
                 sensor, touched = self._state.sensor, self._state.object
                 self._sensor = choice("sensor", sorted({*list_specifications("sensors"), sensor}), sensor, self._change_sensor)
                 self._object = choice("object", sorted({*list_specifications("objects"), touched}), touched, self._change_object)
-                self._page.upload(
-                    "Upload an object (mesh)", ".stl,.obj,.ply", self._touch, hint="lengths in mm; or drop the file on the page"
-                )
+                page.upload("Upload an object (mesh)", ".stl,.obj,.ply", self._touch, hint="lengths in mm; or drop the file on the page")
                 self._friction = watch(gui.add_slider("friction", 0.0, MOST_FRICTION, 0.01, self._own_friction()), self._change_friction)
                 button("Restart contact", self.restart_contact, hint="clear the friction history and press straight down")
             with gui.add_folder("Show"):
@@ -250,21 +248,20 @@ class TwinMode(PageMode):
                 button("Save contact files", self.save_contact)
                 button("Save state", self.save_state)
                 opened = gui.add_upload_button("Open a state", mime_type=".json")
-                self._link = gui.add_text(
-                    "link", self.state.link(self._page.url), hint="opens this state again; paste another one to open it"
-                )
+                link = self.state.link(page.url)
+                self._link = gui.add_text("link", link, hint="opens this state again; paste another one to open it")
                 self._filming = watch(gui.add_checkbox("record a video", False), self._toggle_film)
-        upload.on_upload(guarded(lambda: self.play(read_trajectory(upload.value.content, upload.value.name))))
-        opened.on_upload(guarded(lambda: self.open(StudioState.read(opened.value.content, opened.value.name))))
+        upload.on_upload(page.guard(lambda: self.play(read_trajectory(upload.value.content, upload.value.name))))
+        opened.on_upload(page.guard(lambda: self.open(StudioState.read(opened.value.content, opened.value.name))))
         watch(self._link, lambda: self._links.give(self._link.value))
         for modifier, names in CHANGED.items():
             for keys, name in zip(KEYS, names, strict=True):
                 for key, sign in zip(keys, (-1, +1), strict=True):
                     label = f"{readable_name(name)} {'+' if sign > 0 else '-'}{STEPS[unit_of(name)]:g} {unit_of(name)}"
                     command = gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]  # viser defines it as a literal
-                    command.on_trigger(guarded(partial(self.nudge, name, sign)))
-        gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(guarded(self.undo))
-        gui.add_command("Tap and shear", hotkey="T", modifier="shift").on_trigger(guarded(self.tap_and_shear))
+                    command.on_trigger(page.guard(partial(self.nudge, name, sign)))
+        gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(page.guard(self.undo))
+        gui.add_command("Tap and shear", hotkey="T", modifier="shift").on_trigger(page.guard(self.tap_and_shear))
 
     def _forms(self) -> tuple[str, ...]:
         """The forms of the sensor's frames."""

@@ -101,9 +101,8 @@ def in_processes(begin: Begin[Task, Made], given: tuple[object, ...], tasks: Seq
         for process in busy:
             process.end()
     if given_up := [number for number, times in lost.items() if times == TRIES]:
-        raise WorkersError(
-            f"{len(given_up)} of {len(tasks)} tasks ended their process {TRIES} times; is there enough memory for {processes}? {AGAIN}"
-        )
+        ended = f"{len(given_up)} of {len(tasks)} tasks ended their process {TRIES} times"
+        raise WorkersError(f"{ended}; is there enough memory for {processes}? {AGAIN}")
 
 
 class _Process:

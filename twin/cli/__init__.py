@@ -55,12 +55,8 @@ class _Commands(TyperGroup):
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         width = max(map(len, self.list_commands(ctx)))
         for title, names in self.commands_by_title(ctx).items():
-            commands = [self.get_command(ctx, name) for name in names]
-            rows = [
-                (f"{name:{width}}", command.get_short_help_str(formatter.width - width - 6))
-                for name, command in zip(names, commands, strict=True)
-                if command
-            ]
+            commands = [(name, self.get_command(ctx, name)) for name in names]
+            rows = [(f"{name:{width}}", each.get_short_help_str(formatter.width - width - 6)) for name, each in commands if each]
             with formatter.section(title):
                 formatter.write_dl(rows)
 

@@ -275,11 +275,8 @@ def add_contact(page: Page, result: ContactResult, skin: Path) -> None:
     found = "Pins found (green), graph edges (blue) and Voronoi cells (white); yellow crosses are spots that are not pins."
     change = "Voronoi cell areas against no contact: cells grow where the dome flattens."
     surfaces = "Cell area interpolated over the image: no contact, contact, difference."
-    page.figures(
-        chart("graph", graph_figure, "pins and Voronoi graph", found),
-        chart("areas", areas_figure, "Voronoi area change", change),
-        layout="row",
-    )
+    pins = chart("graph", graph_figure, "pins and Voronoi graph", found)
+    page.figures(pins, chart("areas", areas_figure, "Voronoi area change", change), layout="row")
     page.figures(chart("surfaces", lambda: plots.area_surface_figure(rest, graph), "interpolated area surfaces", surfaces))
     rows = [{"name": name, "value": value} for name, value in contact_figures(result)]
     page.table(rows, [Column("name", "figure"), Column("value", "value")])
@@ -287,17 +284,11 @@ def add_contact(page: Page, result: ContactResult, skin: Path) -> None:
 
 def add_motions(page: Page, motions: Path) -> None:
     """Add the chart of `motion_figure`."""
-    page.section(
-        "Three motions, three signatures",
-        "Pressing (Z) spreads the pins outwards. Dragging along x or y carries them with the object until they slip.",
-    )
-    page.figures(
-        PagePicture(
-            motions,
-            "Displacement of the pins and change of the Voronoi areas for motions along Z, X and Y",
-            f"Pin displacement (top) and Voronoi area change (bottom) for motions along Z, X and Y, on {CONTACTS[0][0]}.",
-        )
-    )
+    lead = "Pressing (Z) spreads the pins outwards. Dragging along x or y carries them with the object until they slip."
+    page.section("Three motions, three signatures", lead)
+    shown = "Displacement of the pins and change of the Voronoi areas for motions along Z, X and Y"
+    said = f"Pin displacement (top) and Voronoi area change (bottom) for motions along Z, X and Y, on {CONTACTS[0][0]}."
+    page.figures(PagePicture(motions, shown, said))
 
 
 def add_tables(page: Page, tables: Mapping[str, Sequence[DepthRow]]) -> None:

@@ -301,9 +301,8 @@ class StudioPage:
         with pictures.add_tab("Camera"):
             self._absent = gui.add_html("")
             empty = np.zeros((8, 8, 3), np.uint8)
-            self._camera, self._cells = (
-                gui.add_image(empty, label="", format="jpeg", jpeg_quality=JPEG_QUALITY, visible=False) for _ in range(2)
-            )
+            shown = [gui.add_image(empty, label="", format="jpeg", jpeg_quality=JPEG_QUALITY, visible=False) for _ in range(2)]
+            self._camera, self._cells = shown
         self.charts_tab = pictures.add_tab("Charts")
         with self.charts_tab:  # PAGE hides this beside a chart
             none = "There is no chart. Forces and estimates of the modes Twin and Live give charts."

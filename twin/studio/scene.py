@@ -37,6 +37,9 @@ NEAR_FOOT_MM = 2.5
 HOLDER_MM = 14.0
 """Height of the drawn holder, mm."""
 SKIN_RGB, OBJECT_RGB, HOLDER_RGB, FORCE_RGB = (128, 146, 184), (120, 168, 232), (78, 85, 98), (255, 176, 32)
+UNSHADED: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
+SURFACE: dict[str, Any] = {"side": "double", **UNSHADED}
+"""How solids and surfaces are drawn."""
 GIZMO_MM = 16.0
 """Size of the gizmo, mm."""
 GLOW = cv2.applyColorMap(np.linspace(0.22 * 255, 0.97 * 255, 256).astype(np.uint8)[:, None], cv2.COLORMAP_INFERNO)[:, 0, ::-1]
@@ -152,16 +155,13 @@ class PinScene:
 
     def __init__(self, server: viser.ViserServer, sensor: SensorSpec, skin: PaintedSurface, rest: PinState) -> None:
         radius_mm, pin = max(sensor.skin.half_size_mm), pin_shape(sensor.pins)
-        shadows: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
         self._scene = server.scene
         self._scene.configure_environment_map(None)
         self._scene.configure_default_lights(enabled=True, cast_shadow=False)
         self._scene.add_light_ambient("/light", intensity=2.0)
         server.initial_camera.position = (1.2 * radius_mm, -3.4 * radius_mm, 1.7 * radius_mm)
         server.initial_camera.look_at = (0.0, 0.0, 0.7 * sensor.skin.apex_mm)
-        self._skin = self._scene.add_mesh_simple(
-            "/sensor/skin", skin.vertices_mm, skin.faces, color=SKIN_RGB, opacity=0.45, side="double", **shadows
-        )
+        self._skin = self._scene.add_mesh_simple("/sensor/skin", skin.vertices_mm, skin.faces, color=SKIN_RGB, opacity=0.45, **SURFACE)
         self._pins = self._scene.add_batched_meshes_simple(
             "/sensor/pins",
             pin.vertices_mm,
@@ -170,10 +170,9 @@ class PinScene:
             rest.caps_mm.astype(np.float32),
             batched_colors=colours(np.zeros(len(rest.caps_mm)), PinColour.DISPLACEMENT),
             lod="off",
-            side="double",
-            **shadows,
+            **SURFACE,
         )
-        place = {"color": HOLDER_RGB, "position": (0.0, 0.0, sensor.skin.rim_z_mm - HOLDER_MM / 2 - 0.05)} | shadows
+        place = {"color": HOLDER_RGB, "position": (0.0, 0.0, sensor.skin.rim_z_mm - HOLDER_MM / 2 - 0.05)} | UNSHADED
         if sensor.skin.shape == "rectangular-pad":
             across, along = (2.04 * half for half in sensor.skin.half_size_mm)
             self._scene.add_box("/sensor/holder", dimensions=(across, along, HOLDER_MM), **place)
@@ -189,9 +188,7 @@ class PinScene:
         """Show another object, or another part of it: that in a box (x0, x1, y0, y1, z0, z1) of its frame."""
         surface = object_surface(build_field(obj).distance, np.eye(4), bounds_mm=bounds_mm, samples=OBJECT_SAMPLES).triangulate()
         corners, faces = np.asarray(surface.points, np.float32), np.asarray(surface.regular_faces)
-        self._object = self._scene.add_mesh_simple(
-            "/object", corners, faces, color=OBJECT_RGB, opacity=0.35, side="double", cast_shadow=False, receive_shadow=False
-        )
+        self._object = self._scene.add_mesh_simple("/object", corners, faces, color=OBJECT_RGB, opacity=0.35, **SURFACE)
 
     def show_pins(self, pins: PinState, skin_mm: FloatArray, colour: np.ndarray) -> None:
         """Show pins with their colours (N, 3) uint8, and the skin's vertices (v, 3)."""

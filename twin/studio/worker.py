@@ -82,11 +82,7 @@ class Worker(_OwnThread):
     """
 
     def __init__(
-        self,
-        contact: MovingContact,
-        tracer: Tracer | None,
-        on_answer: Callable[[ContactAnswer], None],
-        on_message: Callable[[str], None] = lambda text: None,
+        self, contact: MovingContact, tracer: Tracer | None, on_answer: Callable[[ContactAnswer], None], on_message: Callable[[str], None]
     ) -> None:
         self._contact, self._tracer = contact, tracer
         self._on_answer, self._on_message = on_answer, on_message

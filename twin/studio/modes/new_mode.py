@@ -57,9 +57,8 @@ class NewMode(PageMode):
             page.upload_frames(self._take_upload)
             self._no_contact = gui.add_text("no-contact frame", "", hint="a picture without contact; may be empty")
             self._layout = gui.add_text("layout", "", hint="empty: identified; or rings:10, hexagon:6, grid:9x7, positions:FILE.csv")
-            self._radius = gui.add_text(
-                CONTROLS["radius_mm"], "", hint="empty: 20, that of a printed TacTip; all lengths are in proportion to it"
-            )
+            hint = "empty: 20, that of a printed TacTip; all lengths are in proportion to it"
+            self._radius = gui.add_text(CONTROLS["radius_mm"], "", hint=hint)
             page.button("Propose a specification", self.propose)
             correct = gui.add_button_group("correct the layout", (SMALLER, LARGER))
             self._number = page.watch(gui.add_slider("frame shown", 0, 1, 1, 0, disabled=True), self._look_again)

@@ -98,9 +98,8 @@ class TwinMode(PageMode):
         self._links = self.newest(self._open_link, "link")
         page.on_address = self._links.give
         self._build_controls()
-        self._forces, self._estimates, self._depths = self.charts = tuple(
-            LineChart(page, title) for title in ("force on the object, N", "error of the estimates", "indentation, mm")
-        )
+        titles = "force on the object, N", "error of the estimates", "indentation, mm"
+        self._forces, self._estimates, self._depths = self.charts = tuple(LineChart(page, title) for title in titles)
 
     # start and end
 
@@ -166,13 +165,8 @@ class TwinMode(PageMode):
     @property
     def state(self) -> StudioState:
         """The whole state."""
-        return self._state.alter(
-            friction=self.contact.setup.friction,
-            pose=asdict(self._wish),
-            form=self.contact.setup.form,
-            colour=self._shown,
-            drawn=self._drawn,
-        )
+        setup, pose = self.contact.setup, asdict(self._wish)
+        return self._state.alter(friction=setup.friction, pose=pose, form=setup.form, colour=self._shown, drawn=self._drawn)
 
     # wishes
 
@@ -456,7 +450,7 @@ class TwinMode(PageMode):
     def _numbers(self, answer: ContactAnswer) -> list[str]:
         state, seen = answer.state, answer.seen
         moving = "moving" if not answer.arrived else "still"
-        mesh = str(answer.mesh) if len(state.contact_mm) else "no contact"
+        touched, untouched = len(state.contact_mm) > 0, paragraph("No contact, therefore no estimate.", "note")
         force, torque = np.round(state.force_n, 2) + 0.0, round(float(state.torque_nmm[2]), 1) + 0.0
         across, into = float(np.hypot(*state.force_n[:2])), float(state.force_n[2])
         ends = force_interval(state.force_n.tolist(), self.contact.setup.sensor.skin.stiffness_factor)
@@ -472,12 +466,12 @@ class TwinMode(PageMode):
         full, unit = FULL_SCALE[self._shown]
         return [
             f"<span data-number='{answer.number}' data-depth='{answer.pose.depth_mm:.6f}'></span>",
-            badge(moving, moving) + badge(answer.lit, "still" if answer.lit is Light.TRACED else "") + badge(mesh),
+            badge(moving, moving)
+            + badge(answer.lit, "still" if answer.lit is Light.TRACED else "")
+            + badge(answer.mesh if touched else "no contact"),
             paragraph(answer.stopped, "stop"),
             number_table(rows),
-            estimate_table(answer.estimate, answer.labels, missing=self.model_note)
-            if len(state.contact_mm)
-            else paragraph("No contact, therefore no estimate.", "note"),
+            estimate_table(answer.estimate, answer.labels, missing=self.model_note) if touched else untouched,
             paragraph(self.contact.fine_lost, "note"),
             paragraph(f"pins coloured by {self._shown}: dark 0, bright {full:g} {unit}; {sum(answer.ms.values()):.0f} ms latency", "note"),
         ]

@@ -13,6 +13,7 @@ from typer import BadParameter, Option
 
 from twin.cli import group, options
 from twin.cli.options import Formerly, call, each_once, finite, names_in
+from twin.errors import ErrorsAs
 from twin.progress import Progress
 from twin.types import FINE
 
@@ -177,10 +178,9 @@ def study_sim_to_real(
 
 def numbers_in(text: str, option: str, least: int) -> tuple[int, ...]:
     """The comma-separated whole numbers, each at least ``least`` and at most the largest seed."""
-    try:
+    refusal = BadParameter(f"takes whole numbers with commas between, got {text!r}", param_hint=option)
+    with ErrorsAs(ValueError, lambda error: refusal):
         numbers = tuple(int(part) for part in names_in(text))
-    except ValueError as error:
-        raise BadParameter(f"takes whole numbers with commas between, got {text!r}", param_hint=option) from error
     if any(not least <= number <= options.MOST_SEED for number in numbers):
         raise BadParameter(f"takes whole numbers from {least} to {options.MOST_SEED}, got {text!r}", param_hint=option)
     return numbers

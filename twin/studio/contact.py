@@ -220,8 +220,7 @@ class MovingContact:
         """Forget the contact and its friction. The next move presses the object straight down to its pose."""
         self._follower = Follower(self.solver, self.setup.obj, self.setup.law)
         self._T: FloatArray | None = None
-        self._blocked: FloatArray | None = None
-        self._why_blocked = ""
+        self._blocked = False  # whether the last step had no solution
         self._fine: Follower | None = None
         self._fine_T: FloatArray | None = None
         self.fine_lost = ""  # why this contact has no answer on the fine mesh; "" if it has one or may still get one
@@ -240,9 +239,7 @@ class MovingContact:
             limit = deepest_mm(self.setup.sensor.geometry)
             return f"it would be more than {limit:.1f} mm inside the skin, which is half the gel's depth"
         gap_mm, place = self._follower.nearest(T)
-        if gap_mm >= 0:
-            return ""
-        if place[2] < self.setup.sensor.skin.rim_z_mm + RIM_MARGIN_MM:
+        if gap_mm < 0 and place[2] < self.setup.sensor.skin.rim_z_mm + RIM_MARGIN_MM:
             return "it would press beyond the rim, where the skin is clamped"
         return ""
 
@@ -275,10 +272,6 @@ class MovingContact:
             depth_mm += gap_mm
         return 0.0
 
-    def _is_there(self, goal: FloatArray) -> bool:
-        near = (T for T in (self._T, self._blocked) if T is not None)
-        return any(np.abs(T - goal).max() < SAME_MM for T in near)
-
     def _next(self, goal: FloatArray) -> FloatArray:
         """The next pose (4, 4) on the straight path to a goal: one load step further in contact, else as far as nothing touches."""
         if self._T is None:
@@ -303,18 +296,17 @@ class MovingContact:
         try:
             state = self._follower.move(T, now)
         except ContactError as error:
-            self._blocked, self._why_blocked = goal, f"the object stays here: {error}"
+            self._blocked = True
             if self._last is None:
                 raise
             self._count += 1
-            self._last = replace(self._last, number=self._count, arrived=True, stopped=self._why_blocked)
+            self._last = replace(self._last, number=self._count, arrived=True, stopped=f"the object stays here: {error}")
             return self._last
         self._store_path(T)
         self._solved += 1
         solved_ms = 1e3 * (time.perf_counter() - started)
-        arrived = self._is_there(goal)
-        stopped = (self._why_blocked if self._blocked is not None and np.array_equal(self._blocked, goal) else reason) if arrived else ""
-        return self._answer(T, state, SolvedMesh.USUAL, arrived=arrived, stopped=stopped, ms={"contact": solved_ms})
+        arrived = bool(np.abs(T - goal).max() < SAME_MM)
+        return self._answer(T, state, SolvedMesh.USUAL, arrived=arrived, stopped=reason if arrived else "", ms={"contact": solved_ms})
 
     def newest_traced(self, solved: int, light: FloatArray, lit: Light, traced_ms: float) -> ContactAnswer | None:
         """The newest answer with path-traced light (h, w) or (h, w, 3) of a contact; None if a newer contact was solved since."""
@@ -371,8 +363,8 @@ class MovingContact:
 
     def _store_path(self, T: FloatArray) -> None:
         """Store the path for the fine mesh. A contact's path begins at the last free pose, or where the contact was started again."""
-        begun_anew = self._T is None or self._blocked is not None or self._follower.restarts != self._restarts
-        self._blocked, self._refined, self._restarts = None, False, self._follower.restarts
+        begun_anew = self._T is None or self._blocked or self._follower.restarts != self._restarts
+        self._blocked, self._refined, self._restarts = False, False, self._follower.restarts
         if begun_anew or self._follower.gap_mm(T) >= 0:
             self._way.clear()
             self._fine, self._fine_T, self.fine_lost = None, None, ""
@@ -397,21 +389,23 @@ class MovingContact:
         started = time.perf_counter()
         light, lit = traced or (self.camera.draw(state), Light.RASTERISED)
         raw = self.camera.raw(light, seed=self._count)
-        now = time.perf_counter()
-        needs_recorded = self.setup.form is Form.PROCESSED or (self.model is not None and self.model.form is Form.PROCESSED)
-        frames = {Form.RAW: raw} | ({Form.PROCESSED: self.camera.as_recorded(raw)} if needs_recorded else {})
-        frame = frames[self.setup.form]
-        estimate = None if self.model is None else self.model(frames[self.model.form])
-        estimated = time.perf_counter()
-        of_frame = self.model is not None and self.model.form is self.setup.form
-        seen = pins_in(frame, estimate if of_frame else None, self._pipeline)
-        times = {"picture": now - started, "estimate": estimated - now, "pins": time.perf_counter() - estimated}
+        drawn = time.perf_counter()
+        frame, estimate, seen = self.observe(raw, self.setup.form, self._pipeline)
+        times = {"picture": drawn - started, "estimate and pins": time.perf_counter() - drawn}
         labels = self.labels(state.T_sensor_object if len(state.contact_mm) else T)
         self._last = ContactAnswer(
             self.setup, self._count, self._solved, ObjectPose.of(T, self._apex_mm), -self._follower.gap_mm(T), state, light, frame, seen,
             estimate, labels, lit, mesh, arrived, stopped, ms | {name: 1e3 * value for name, value in times.items()},
         )  # fmt: skip
         return self._last
+
+    def observe(self, raw: Frame, form: Form, pipeline: Pipeline) -> tuple[Frame, Estimate | None, Observation]:
+        """A raw frame in a form, the model's estimate (None without a model), and the pins that the pipeline finds in that form."""
+        model = self.model
+        frames = {each: raw if each is Form.RAW else self.camera.as_recorded(raw) for each in {form, form if model is None else model.form}}
+        estimate = None if model is None else model(frames[model.form])
+        of_frame = model is not None and model.form is form
+        return frames[form], estimate, pins_in(frames[form], estimate if of_frame else None, pipeline)
 
     def labels(self, T: FloatArray) -> dict[str, float]:
         """The true values of the model's labels with the object at ``T`` (4, 4), as far as they are defined; empty without a model."""
@@ -420,8 +414,7 @@ class MovingContact:
             return {}
         flat = surface_labels(experiment, Mounting.of(sensor, experiment), self._surface, T[None])
         known = {name: float(value[0]) for name, value in flat.items()}
-        known |= tilted_labels(rig_of(sensor), experiment, self._surface, self._apex_mm, T) if not known else {}
-        return known
+        return known or tilted_labels(rig_of(sensor), experiment, self._surface, self._apex_mm, T)
 
 
 def experiment_of(model: SensorModel) -> ExperimentSpec | None:

@@ -199,11 +199,10 @@ class Worker(_OwnThread):
     def _take(self, outcome: Outcome) -> None:
         match outcome:
             case Traced():
-                answer = None
-                if not (outcome.rough and self.newest is not None and self.newest.lit is Light.TRACED):  # no good picture gives way
-                    lit = Light.ROUGH if outcome.rough else Light.TRACED
-                    answer = self._contact.newest_traced(outcome.solved, outcome.light, lit, outcome.ms)
-                if answer is not None:
+                if outcome.rough and self.newest is not None and self.newest.lit is Light.TRACED:
+                    return  # no good picture gives way
+                lit = Light.ROUGH if outcome.rough else Light.TRACED
+                if (answer := self._contact.newest_traced(outcome.solved, outcome.light, lit, outcome.ms)) is not None:
                     self._publish(answer)
             case Shading():
                 self._contact.camera.preview.shading = outcome

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.errors import TwinError
-from twin.estimate import Estimate, pins_in
+from twin.estimate import Estimate
 from twin.evaluation.degradation.condition import Condition, DegradedCase
 from twin.evaluation.degradation.conditions import CONDITIONS, condition
 from twin.evaluation.degradation.measures import MEASURES, measure_frame
@@ -83,10 +83,8 @@ class FrameEvaluator:
         shot = degraded_state(self.spec, answer.state, cases, shading=shading, touched=touched)
         figures = measure_frame(self._detector, self._detector(shot.frame), shot)
         failed = tuple(m.title for m in MEASURES if m.exceeds(figures[m.name], self.limits[m.name]))
-        model = self.contact.model
-        estimate = None if model is None else model(shot.frame if model.form is Form.RAW else self.contact.camera.as_recorded(shot.frame))
-        of_frame = model is not None and model.form is Form.RAW
-        return EvaluatedFrame(shot, pins_in(shot.frame, estimate if of_frame else None, self._pipeline), figures, failed, estimate)
+        _, estimate, seen = self.contact.observe(shot.frame, Form.RAW, self._pipeline)
+        return EvaluatedFrame(shot, seen, figures, failed, estimate)
 
 
 class DegradeMode(PageMode):

@@ -45,10 +45,8 @@ class NewMode(PageMode):
     def __init__(self, page: StudioPage, twin: TwinMode, out: Path) -> None:
         super().__init__(page)
         self._twin, self._out = twin, out
-        self._made: NewSensor | None = None
+        self._proposed: tuple[NewSensor, Recording, Pipeline] | None = None
         self._absent = "Give the folder of your sensor's frames, in contact or not, and press 'Propose a specification'."
-        self._recording: Recording | None = None
-        self._pipeline: Pipeline | None = None
         self._making = self.newest(self._make, "new")
         self._looking = self.newest(self._look, "new-frame")
         gui = page.gui
@@ -67,7 +65,7 @@ class NewMode(PageMode):
 
     def show(self) -> None:
         """Show the newest proposal."""
-        if self._made is None:
+        if self._proposed is None:
             self._page.show_nothing(self._absent)
         else:
             self._look_again()
@@ -94,7 +92,7 @@ class NewMode(PageMode):
         refusal = TwinError(f"`radius_mm` {quote(radius)}: give a number, or nothing for a printed TacTip's 20")
         with ErrorsAs(ValueError, lambda error: refusal):
             radius_mm = float(radius) if radius else None
-        self._made, self._absent = None, "The frames are being processed."
+        self._proposed, self._absent = None, "The frames are being processed."
         self.show()
         self._making.give((Path(frames), Path(no_contact) if no_contact else None, layout, radius_mm))
 
@@ -125,9 +123,9 @@ class NewMode(PageMode):
         self._page.choose(self._twin.title)
 
     def _proposal(self) -> NewSensor:
-        if self._made is None:
+        if self._proposed is None:
             raise TwinError("nothing has been proposed yet; press 'Propose a specification' first")
-        return self._made
+        return self._proposed[0]
 
     def _make(self, wish: Wish) -> None:
         def report(stage: str, done: float, total: float, note: str = "") -> None:
@@ -146,16 +144,15 @@ class NewMode(PageMode):
                 self.show()
             return
         recording = open_recording(frames_at(frames, None, no_contact), made.sensor)
-        self._made, self._recording = made, recording
-        self._pipeline = Pipeline(made.sensor, recording.form)
+        self._proposed = made, recording, Pipeline(made.sensor, recording.form)
         self._number.max, self._number.disabled = max(1, len(recording) - 1), False
         self._page.say(f"wrote {made.written[0]}, and a page beside it")
         self._looking.give(min(int(self._number.value), len(recording) - 1))
 
     def _look(self, index: int) -> None:
-        made, recording, pipeline = self._made, self._recording, self._pipeline
-        if made is None or recording is None or pipeline is None or not self._active:
+        if (proposed := self._proposed) is None or not self._active:
             return
+        made, recording, pipeline = proposed
         frame = recording.read(int(np.clip(index, 0, len(recording) - 1)))
         seen = pipeline(frame)
         camera = camera_picture(frame, seen, pipeline.reference.pins_px, OverlayChoices.GRAPH)

@@ -198,13 +198,10 @@ def read_section(path: Path, model: type[Spec]) -> Spec:
 
 def _validate(data: dict[str, object], path: Path, model: type[Spec]) -> Spec:
     try:
-        data = fill_in_tables(data, path.parent)
+        return model.model_validate(fill_in_tables(data, path.parent))
     except ValueError as error:
-        raise SpecError(f"{path}: {error}") from error
-    try:
-        return model.model_validate(data)
-    except ValidationError as error:
-        raise SpecError(f"{path}: {explain_problems(error, model)}") from error
+        problem = explain_problems(error, model) if isinstance(error, ValidationError) else error
+        raise SpecError(f"{path}: {problem}") from error
 
 
 def explain_problems(error: ValidationError, model: type[BaseModel]) -> str:

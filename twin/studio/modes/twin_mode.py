@@ -377,9 +377,8 @@ class TwinMode(PageMode):
 
     def _open_link(self, link: str) -> None:
         """Show the state of a link, unless the page shows it already."""
-        if link.partition("?")[2] == self.state.link().partition("?")[2]:
-            return
-        self.open(StudioState.of_link(link))
+        if link.partition("?")[2] != self.state.link().partition("?")[2]:
+            self.open(StudioState.of_link(link))
 
     # answers
 
@@ -451,6 +450,7 @@ class TwinMode(PageMode):
         state, seen = answer.state, answer.seen
         moving = "moving" if not answer.arrived else "still"
         touched, untouched = len(state.contact_mm) > 0, paragraph("No contact, therefore no estimate.", "note")
+        mesh = answer.mesh if touched else "no contact"
         force, torque = np.round(state.force_n, 2) + 0.0, round(float(state.torque_nmm[2]), 1) + 0.0
         across, into = float(np.hypot(*state.force_n[:2])), float(state.force_n[2])
         ends = force_interval(state.force_n.tolist(), self.contact.setup.sensor.skin.stiffness_factor)
@@ -466,9 +466,7 @@ class TwinMode(PageMode):
         full, unit = FULL_SCALE[self._shown]
         return [
             f"<span data-number='{answer.number}' data-depth='{answer.pose.depth_mm:.6f}'></span>",
-            badge(moving, moving)
-            + badge(answer.lit, "still" if answer.lit is Light.TRACED else "")
-            + badge(answer.mesh if touched else "no contact"),
+            badge(moving, moving) + badge(answer.lit, "still" if answer.lit is Light.TRACED else "") + badge(mesh),
             paragraph(answer.stopped, "stop"),
             number_table(rows),
             estimate_table(answer.estimate, answer.labels, missing=self.model_note) if touched else untouched,
@@ -525,10 +523,9 @@ class TwinMode(PageMode):
             self._page.say(f"saved {save_trajectory(next_path(self._out, 'trajectory', '.csv'), kept)} (poses: {len(kept)})")
 
     def _toggle_film(self) -> None:
+        self._end_film()
         if self._filming.value:
             self._film = FilmWriter(next_path(self._out, "video", ".mp4"))
-        else:
-            self._end_film()
 
     def _end_film(self) -> None:
         film, self._film = self._film, None

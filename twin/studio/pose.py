@@ -67,10 +67,6 @@ class ObjectPose:
                 reasons.append(f"{readable_name(name)} is limited to {kept[name]:g} {unit_of(name)}: {why}")
         return ObjectPose(**kept), "; ".join(reasons)
 
-    def words(self) -> str:
-        """All six numbers with their units."""
-        return ", ".join(f"{readable_name(name)} {value:+.2f} {unit_of(name)}" for name, value in asdict(self).items())
-
 
 @dataclass(frozen=True)
 class PressedPose(ObjectPose):

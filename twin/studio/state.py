@@ -9,7 +9,7 @@ from pathlib import Path
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from scenes import load_object, load_sensor
 from scenes.base import NonNegative, Section, SpecError, problem_text
@@ -59,9 +59,9 @@ class StudioState(Section):
     object: str
     friction: NonNegative | None = None
     pose: dict[str, float] = {}
-    form: Form = Form.RAW
-    colour: PinColour = PinColour.DISPLACEMENT
-    drawn: OverlayChoices = OverlayChoices.GRAPH
+    form: Form = Field(Form.RAW, strict=False)
+    colour: PinColour = Field(PinColour.DISPLACEMENT, strict=False)
+    drawn: OverlayChoices = Field(OverlayChoices.GRAPH, strict=False)
 
     def object_pose(self) -> ObjectPose:
         """The object's pose."""

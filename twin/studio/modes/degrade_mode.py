@@ -7,7 +7,7 @@ import numpy as np
 
 from twin.errors import TwinError
 from twin.estimate import Estimate
-from twin.evaluation.degradation.condition import Condition, DegradedCase
+from twin.evaluation.degradation.condition import DegradedCase
 from twin.evaluation.degradation.conditions import CONDITIONS, condition
 from twin.evaluation.degradation.measures import MEASURES, measure_frame
 from twin.evaluation.degradation.shots import DegradedFrame, degraded_state
@@ -30,11 +30,6 @@ NO_CONDITION = "nothing"
 """Name of the choice for a slider without a condition."""
 FIRST = ("defocus", "caps-missing", "camera-rolled")
 """Conditions that are selected at first, if they exist."""
-
-
-def selectable_conditions() -> dict[str, Condition]:
-    """The selectable conditions by title. Those that change mechanics or pipeline settings are left out, as the contact is given."""
-    return {f"{c.title} ({c.family})": c for c in CONDITIONS.values() if not c.solves and c.setting is None}
 
 
 @dataclass(frozen=True)
@@ -106,7 +101,8 @@ class DegradeMode(PageMode):
         self._edge, self._finding = "", False
         self._pose: ObjectPose | None = None
         self._wanted = self.newest(self._show, "degrade")
-        conditions = selectable_conditions()
+        # by title, without those that change mechanics or settings of the pipeline, as the contact is given
+        conditions = {f"{c.title} ({c.family})": c for c in CONDITIONS.values() if not c.solves and c.setting is None}
         titles = (NO_CONDITION, *conditions)
         by_name = {c.name: title for title, c in conditions.items()}
         self._conditions, self._controls = conditions, []

@@ -90,19 +90,16 @@ class RecordingView:
 
     def _fitting(self, model: SensorModel | None) -> SensorModel | None:
         """The model for this recording's frames. It uses the recording's no-contact frame if both allow this."""
-        if model is None:
-            self.notes.append("no estimates: there is no model of this sensor")
+        form, rest = self.recording.form, self.recording.reference
+        try:
+            if model is None:
+                raise FrameError("there is no model of this sensor")
+            if model.form != form:
+                raise FrameError(f"the model is for {model.form} frames, these are {form} ones")
+            return model if rest is None or not model.counts_from_rest else model.at_rest(rest)
+        except FrameError as error:
+            self.notes.append(f"no estimates: {error}")
             return None
-        if model.form != self.recording.form:
-            self.notes.append(f"no estimates: the model is for {model.form} frames, these are {self.recording.form} ones")
-            return None
-        if model.counts_from_rest and self.recording.reference is not None:
-            try:
-                return model.at_rest(self.recording.reference)
-            except FrameError as error:
-                self.notes.append(f"no estimates: {error}")
-                return None
-        return model
 
     def look(self, index: int) -> Looked:
         """A frame, what is found in it, and its label.

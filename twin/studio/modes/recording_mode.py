@@ -183,9 +183,9 @@ class RecordingMode(PageMode):
         """Show the recording. The recording that the command named is opened now."""
         self._page.show_nothing("Give a recording's folder or video and press 'Open'.")
         if self._view is None and self._first:
-            self.open(self._first)
+            self._page.guard(lambda: self.open(self._first))(self)
         elif self._view is not None and self._view.contact is not self._twin.contact:  # the user has changed the sensor
-            self.open(self._path.value)
+            self._page.guard(lambda: self.open(self._path.value))(self)
         else:
             self._show_again()
 
@@ -193,15 +193,16 @@ class RecordingMode(PageMode):
         self._wanted.give(int(self._number.value))
 
     def open(self, path: str) -> None:
-        """Show another recording. Errors are shown on the page."""
-        self._page.hush()
-        try:
-            if not path.strip():
-                raise TwinError("give a recording's folder or video first")
-            self._view = RecordingView(path.strip(), self._twin.contact)
-        except TwinError as error:
-            self.complain(str(error))
-            return
+        """Show another recording.
+
+        Raises
+        ------
+        TwinError
+            There is no such recording, or it belongs to another sensor.
+        """
+        if not path.strip():
+            raise TwinError("give a recording's folder or video first")
+        self._view = RecordingView(path.strip(), self._twin.contact)
         self._number.max = max(1, len(self._view) - 1)
         self._number.disabled = False
         self._go(0)

@@ -89,6 +89,16 @@ class StandTracer:
         return jobs
 
 
+class StartedWorker(Worker):
+    """Works in its context."""
+
+    def __enter__(self):
+        self.start()
+
+    def __exit__(self, *_):
+        self.stop()
+
+
 def run(contact, tracer=None):
     answers, said, news = [], [], threading.Condition()
 
@@ -101,7 +111,7 @@ def run(contact, tracer=None):
         with news:
             assert news.wait_for(lambda: any(map(wanted, answers)), WAIT_S)
 
-    return Worker(contact, tracer, heard, said.append), answers, said, wait
+    return StartedWorker(contact, tracer, heard, said.append), answers, said, wait
 
 
 def test_only_the_newest_wish_counts():

@@ -88,7 +88,7 @@ Outcome = Shading | Traced | Saved | Failed
 
 
 class Tracer:
-    """Path-traces contacts of one sensor. Of several waiting contacts only the newest is traced. A context manager.
+    """Path-traces contacts of one sensor. Of several waiting contacts only the newest is traced. Call ``close`` at the end.
 
     The first outcome is the preview's shading. Each contact has two outcomes: the first pass, and the mean of all passes.
 
@@ -163,10 +163,8 @@ class Tracer:
                 why = "the path tracer's process has ended; pictures stay rasterised. Start the studio again"
                 self._found.append(Failed(why, tracing=True))
 
-    def __enter__(self) -> "Tracer":
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """End the process."""
         self._ended = True
         with suppress(OSError):
             self._here.send(None)  # closing the socket alone does not wake the thread that reads from it

@@ -68,7 +68,7 @@ class _OwnThread(ABC):
 
 
 class Worker(_OwnThread):
-    """Moves a contact in its own thread. A context manager.
+    """Moves a contact in its own thread.
 
     Parameters
     ----------
@@ -127,13 +127,6 @@ class Worker(_OwnThread):
         answer = self._contact.again()
         if answer is not None:
             self._publish(answer)
-
-    def __enter__(self) -> "Worker":
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
 
     def _run(self) -> None:
         while True:

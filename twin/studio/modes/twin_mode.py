@@ -128,16 +128,16 @@ class TwinMode(PageMode):
 
     def _begin(self) -> None:
         self._loading = False
-        self.worker.__enter__()
+        self.worker.start()
         self.worker.do(self.contact.warm_up)
         self.worker.ask(self._wish)
 
     def stop(self) -> None:
         """End threads and processes."""
         self._end_film()
-        self.worker.__exit__(None, None, None)
+        self.worker.stop()
         if self._tracer is not None:
-            self._tracer.__exit__(None, None, None)
+            self._tracer.close()
         super().stop()
 
     def _load_model(self, name: str) -> None:
@@ -350,9 +350,9 @@ class TwinMode(PageMode):
         with self._rebuilding:
             self._page.say(f"opening {state.sensor} against {state.object} ...")
             prepared = self._prepare(state)
-            self.worker.__exit__(None, None, None)
+            self.worker.stop()
             if self._tracer is not None:
-                self._tracer.__exit__(None, None, None)
+                self._tracer.close()
             self._page.gui.set_panel_label(heading(state))
             before, friction = self._choices(), self._own_friction()
             self._state, wish = state, self._wish

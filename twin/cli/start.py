@@ -15,7 +15,7 @@ from typer import Option
 
 from twin.cli import app, options
 from twin.cli.options import call, print_lines
-from twin.errors import extras_named
+from twin.errors import library
 from twin.progress import Progress
 from twin.signals import signals_as_ctrl_c
 from twin.types import Form, Quality
@@ -258,13 +258,6 @@ def lazy_models_by_sensor(run: Path | None, sensor: str) -> Callable[[str], "Pos
     """``models_by_sensor``. If no run is given, it loads when the first model is requested, so that the page does not wait for PyTorch."""
 
     def model_of(name: str) -> "PoseEstimator | None":
-        with extras_named():  # called in a thread of the page, which shows the error
-            from training.estimate.loading import models_by_sensor
+        return library("training.estimate.loading").models_by_sensor()(name)
 
-            return models_by_sensor()(name)
-
-    if run is None:
-        return model_of
-    from training.estimate.loading import models_by_sensor
-
-    return models_by_sensor(run, sensor)
+    return model_of if run is None else library("training.estimate.loading").models_by_sensor(run, sensor)

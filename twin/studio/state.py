@@ -6,6 +6,7 @@ import json
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Annotated
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 import numpy as np
@@ -59,9 +60,9 @@ class StudioState(Section):
     object: str
     friction: NonNegative | None = None
     pose: dict[str, float] = {}
-    form: Form = Field(Form.RAW, strict=False)
-    colour: PinColour = Field(PinColour.DISPLACEMENT, strict=False)
-    drawn: OverlayChoices = Field(OverlayChoices.GRAPH, strict=False)
+    form: Annotated[Form, Field(strict=False)] = Form.RAW
+    colour: Annotated[PinColour, Field(strict=False)] = PinColour.DISPLACEMENT
+    drawn: Annotated[OverlayChoices, Field(strict=False)] = OverlayChoices.GRAPH
 
     def object_pose(self) -> ObjectPose:
         """The object's pose."""

@@ -232,13 +232,10 @@ class Simulator:
     def describe(self) -> dict[str, dict[str, object]]:
         """All other parameters of a result besides sensor and object: variant, samples (0 for a rasterised picture), mesh and
         tolerances."""
+        across = self.solver.resolution.across
         return {
             "renderer": {"variant": self.renderer.choice.variant, "samples_per_pixel": self.renderer.spp},
-            "solver": {
-                "elements_across": self.solver.resolution.across,
-                "gap_bound_mm": GAP_BOUND_MM,
-                "residual_tolerance": RESIDUAL_TOLERANCE,
-            },
+            "solver": {"elements_across": across, "gap_bound_mm": GAP_BOUND_MM, "residual_tolerance": RESIDUAL_TOLERANCE},
         }
 
     def check_form(self, form: Form) -> None:

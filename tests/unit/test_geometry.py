@@ -6,7 +6,7 @@ from block import rotation
 from scipy.spatial import cKDTree
 
 from scenes.body import SkinSpec
-from scenes.load import list_sensors, load_sensor
+from scenes.load import list_specifications, load_sensor
 from twin.geometry.mesh import GEL, SKIN, NodeView, build_mesh, skin_surface, to_pyvista
 from twin.geometry.pins import rest_pins
 from twin.geometry.shapes import Chart, Focus, RectangularPad, shape_of, square_of_disc
@@ -309,7 +309,7 @@ def test_a_solid_too_coarse_or_odd_is_refused():
 # --- pins
 
 
-@pytest.mark.parametrize("name", list_sensors())
+@pytest.mark.parametrize("name", list_specifications("sensors"))
 @pytest.mark.parametrize("focus", [Focus(), Focus(0.9, 2.0, turn_rad=1.0)])
 def test_pins_at_rest_are_the_specification_s(name, focus):
     spec = load_sensor(name)

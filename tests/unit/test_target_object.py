@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from scenes.load import list_objects, load_object
+from scenes.load import list_specifications, load_object
 from scenes.object import MeshShape, ObjectSpec, PrismShape, TextureSpec
 from twin.errors import MeshError
 from twin.objects import build_field, mesh_field
@@ -114,7 +114,7 @@ def test_points_may_come_in_any_layout(order, points, fields):
             assert np.array_equal(got, full)
 
 
-@pytest.mark.parametrize("name", list_objects())
+@pytest.mark.parametrize("name", list_specifications("objects"))
 def test_gradient_is_unit_and_the_derivative_of_the_distance(name, points):
     spec = load_object(name)
     field = build_field(spec)
@@ -127,7 +127,7 @@ def test_gradient_is_unit_and_the_derivative_of_the_distance(name, points):
     assert np.quantile(np.linalg.norm(gradient - slope, axis=1), 0.99) < 1e-6
 
 
-@pytest.mark.parametrize("name", [name for name in list_objects() if name != "edge" and name != "mesh-can"])
+@pytest.mark.parametrize("name", [name for name in list_specifications("objects") if name != "edge" and name != "mesh-can"])
 def test_surface_passes_through_the_origin_with_the_object_behind_it(name):
     field = build_field(load_object(name))
     z = np.array([[0, 0, -0.5], [0, 0, 0], [0, 0, 0.5]])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scenes.experiment import LABELS, ExperimentSpec
-from scenes.load import list_experiments, load_experiment
+from scenes.load import list_specifications, load_experiment
 from scenes.pins import PinsSpec
 from twin.calibration.new_sensor import LIMIT, NewSensor, new_sensor
 from twin.errors import OptionError
@@ -149,7 +149,7 @@ def experiment_like(labels: Mapping[str, np.ndarray]) -> ExperimentSpec:
             "no label of a contact varies in the table; expected pose_1..6 and move_1..6, or pose_x..pose_Rz and shear_x..shear_Rz"
         )
     found: list[tuple[float, bool, int, str]] = []
-    for name in list_experiments():
+    for name in list_specifications("experiments"):
         plan = load_experiment(name)
         own = {label for label, (low, high) in plan.ranges().items() if high - low > VARIES}
         # of equally similar experiments, the recorded ones (with a source) come first, then the one with the shortest name

@@ -4,6 +4,7 @@ import importlib
 import pkgutil
 import sys
 import threading
+from contextlib import closing
 from pathlib import Path
 
 
@@ -100,7 +101,7 @@ def studio():
     from twin.studio.tracing import Failed, Tracer
 
     found = threading.Event()
-    with Tracer(twin.load_sensor("mg400-127")) as tracer:
+    with closing(Tracer(twin.load_sensor("mg400-127"))) as tracer:
         tracer.on_outcome = found.set
         tracer.start()
         assert found.wait(100)

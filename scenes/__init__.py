@@ -2,18 +2,7 @@
 
 from scenes.base import SpecError
 from scenes.experiment import ExperimentSpec
-from scenes.load import (
-    list_experiments,
-    list_objects,
-    list_randomisations,
-    list_sensors,
-    load_experiment,
-    load_object,
-    load_randomisation,
-    load_sensor,
-    load_servo,
-    user_spec_dir,
-)
+from scenes.load import list_specifications, load_experiment, load_object, load_randomisation, load_sensor, load_servo, user_spec_dir
 from scenes.object import ObjectSpec
 from scenes.randomisation import RandomisationSpec
 from scenes.rig import RigSpec

@@ -12,7 +12,6 @@ from pydantic import Field, ValidationError, model_validator
 from scenes.base import Name, Section, problem_text
 
 LABELS = tuple(f"{kind}_{axis}" for kind in ("pose", "move") for axis in range(1, 7))
-AXES = {"x": 0, "y": 1, "z": 2}
 
 Range = tuple[float, float]
 Six = tuple[float, float, float, float, float, float]
@@ -139,7 +138,7 @@ class ExperimentSpec(Section):
     @property
     def axis(self) -> int:
         """Index of the approach's coordinate in a pose."""
-        return AXES[self.approach]
+        return "xyz".index(self.approach)
 
     def ranges(self) -> dict[str, Range]:
         """Range of each of the twelve labels, in the recordings' order."""

@@ -1,11 +1,12 @@
-"""Reading specification files: finding them, and errors that name the key and the remedy."""
+"""Reading specification files: finding and listing them, and errors that name the key and the remedy."""
 
 import difflib
 import hashlib
 import os
 import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -40,24 +41,10 @@ def user_spec_dir() -> Path:
     return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "tactip-twin"
 
 
-def list_sensors() -> dict[str, Path]:
-    """Sensor names and their files. A user's own file takes precedence over a shipped one of the same name."""
-    return list_specifications("sensors")
-
-
-def list_objects() -> dict[str, Path]:
-    """Object names and their files. A user's own file takes precedence over a shipped one of the same name."""
-    return list_specifications("objects")
-
-
-def list_experiments() -> dict[str, Path]:
-    """Experiment names and their files. A user's own file takes precedence over a shipped one of the same name."""
-    return list_specifications("experiments")
-
-
-def list_randomisations() -> dict[str, Path]:
-    """Names of randomisations and their files. A user's own file takes precedence over a shipped one of the same name."""
-    return list_specifications("randomisations")
+def list_specifications(kind: str) -> dict[str, Path]:
+    """Names and files of a kind, which is also the name of their folders: a user's own, others', and shipped ones, in this precedence."""
+    shipped, own = ({path.stem: path for path in sorted(folder.glob("*.toml"))} for folder in (SHIPPED / kind, user_spec_dir() / kind))
+    return shipped | other_files(kind, shipped) | own
 
 
 def load_sensor(name_or_path: str | Path | SensorSpec) -> SensorSpec:
@@ -87,21 +74,16 @@ def load_object(name_or_path: str | Path | ObjectSpec) -> ObjectSpec:
             raise SpecError(f"{quote(path, LONGEST_PATH)}: no such mesh file; give the path of an existing STL, OBJ or PLY")
         mesh = MeshShape(kind="mesh", file=str(path.resolve()), sha256=_digest(path))
         return _validate({"name": path.stem, "description": f"mesh {path.name}", "shape": mesh}, path, ObjectSpec)
-    spec_path = _find(name_or_path, "objects")
-    spec = read_section(spec_path, ObjectSpec)
+    place = _find(name_or_path, "objects")
+    spec = read_section(place, ObjectSpec)
     if isinstance(spec.shape, MeshShape):
-        file = spec_path.parent / spec.shape.file
+        file = place.parent / spec.shape.file
         if not os.path.isfile(file):
-            raise SpecError(
-                f"{spec_path}: shape.file: no such mesh file '{quote(spec.shape.file)}'; the path is relative to the specification"
-            )
+            raise SpecError(f"{place}: shape.file: no such mesh file '{quote(spec.shape.file)}'; the path is relative to the specification")
         digest = _digest(file)
         if spec.shape.sha256 not in ("", digest):
-            raise SpecError(
-                f"{spec_path}: shape.sha256: {file} has another content ({digest}); put the right file there, or leave the key out"
-            )
-        found = {"file": str(file.resolve()), "sha256": digest}
-        spec = spec.alter(shape=found)
+            raise SpecError(f"{place}: shape.sha256: {file} has another content ({digest}); put the right file there, or leave the key out")
+        spec = spec.alter(shape={"file": str(file.resolve()), "sha256": digest})
     return spec
 
 
@@ -127,7 +109,7 @@ def load_experiment(name_or_path: str | Path | ExperimentSpec, *, wide: bool = F
         There is no such experiment, its file is not valid, or it has no larger ranges. The message names the file, the key and the remedy.
     """
     name = str(name_or_path).removesuffix(OLD_WIDE)
-    known = {} if name == str(name_or_path) else list_experiments()
+    known = {} if name == str(name_or_path) else list_specifications("experiments")
     if name in known and str(name_or_path) not in known:
         warnings.warn(f"experiment '{name_or_path}' is now '{name}' with `wide`", RuntimeWarning, stacklevel=2)
         return load_experiment(name, wide=True)
@@ -159,10 +141,28 @@ def _load(given: str | Path | Spec, kind: str, model: type[Spec]) -> Spec:
     return given if isinstance(given, model) else read_section(_find(given, kind), model)
 
 
-def list_specifications(kind: str) -> dict[str, Path]:
-    """Names and files of a kind, which is also the name of their folders: a user's own, others', and shipped ones, in this precedence."""
-    shipped, own = ({path.stem: path for path in sorted(folder.glob("*.toml"))} for folder in (SHIPPED / kind, user_spec_dir() / kind))
-    return shipped | other_files(kind, shipped) | own
+_LISTED: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
+    "sensors": (load_sensor, lambda spec: f"{spec.pins.count} pins, {spec.camera.channels}"),
+    "objects": (load_object, lambda spec: spec.shape.kind),
+    "experiments": (load_experiment, lambda spec: ", ".join(spec.targets)),
+    "randomisations": (load_randomisation, lambda spec: f"{len(spec.sensor)} numbers of the sensor"),
+}
+"""Of each kind that a command lists: the function that loads a specification, and a detail of it that its line states."""
+
+
+def catalog_lines(kind: str) -> list[str]:
+    """A line for each specification of a kind that a command lists, then the folder of the shipped files, and that for own files."""
+    load, detail = _LISTED[kind]
+    lines, own = [], user_spec_dir() / kind
+    for name, path in list_specifications(kind).items():
+        try:
+            spec = load(name)
+        except SpecError as error:
+            lines.append(f"{name:16} BROKEN: {error}")
+            continue
+        place = "" if path.is_relative_to(SHIPPED) else f"  [{path}]"
+        lines.append(f"{name:16} {spec.description} ({detail(spec)}){place}")
+    return [*lines, "", f"Shipped files: {SHIPPED / kind}", f"Your own: copy one to {own}/NAME.toml and edit it (or give a path: my.toml)"]
 
 
 def _find(name_or_path: object, kind: str) -> Path:
@@ -175,9 +175,7 @@ def _find(name_or_path: object, kind: str) -> Path:
         raise SpecError(f"{path}: files ending in '{path.suffix}' are not understood here; give one of {suffixes}")
     if path.suffix == ".toml":
         if not os.path.isfile(path):
-            raise SpecError(
-                f"{quote(path, LONGEST_PATH)}: no such file; give the path of an existing TOML specification, or a name ({listed})"
-            )
+            raise SpecError(f"{quote(path, LONGEST_PATH)}: no such file; give the path of a TOML specification, or a name ({listed})")
         return path
     if str(name_or_path) in known:
         return known[str(name_or_path)]
@@ -200,13 +198,10 @@ def read_section(path: Path, model: type[Spec]) -> Spec:
 
 def _validate(data: dict[str, object], path: Path, model: type[Spec]) -> Spec:
     try:
-        data = fill_in_tables(data, path.parent)
+        return model.model_validate(fill_in_tables(data, path.parent))
     except ValueError as error:
-        raise SpecError(f"{path}: {error}") from error
-    try:
-        return model.model_validate(data)
-    except ValidationError as error:
-        raise SpecError(f"{path}: {explain_problems(error, model)}") from error
+        problem = explain_problems(error, model) if isinstance(error, ValidationError) else error
+        raise SpecError(f"{path}: {problem}") from error
 
 
 def explain_problems(error: ValidationError, model: type[BaseModel]) -> str:

@@ -3,7 +3,7 @@
 A sensor, object, experiment, randomisation, servo or limits is the path of a TOML file. An arm is a function of the text after the colon in
 ``NAME:REST``, and a camera a function of this text, the sensor and the form. A world, in which an arm carries a sensor, is a function of
 this text, the sensor and its pose on the tool (``hardware.cameras.twin.World``). A gripper is a function of this text and the sensor
-(``hardware.servo.grippers.Gripper``). A policy is a function of an observation of its environment, which gives the action. A layout,
+(``hardware.servo.grip.Gripper``). A policy is a function of an observation of its environment, which gives the action. A layout,
 material, condition, model or task is the object itself. A part that raises, that is of another kind or that has the name of another one is
 left out, and a warning names it.
 """

@@ -769,7 +769,6 @@ class SensorSpec(Section):
             return
         if reach_mm is None:
             raise ValueError("pins.reach_mm is missing: on a flat pad it is the distance of the outermost pin from the axis")
-        if reach_mm > math.hypot(*(half + skin.rim_z_mm for half in skin.half_size_mm)) or (
-            skin.shape == "round-pad" and reach_mm > skin.outer_radius_mm + skin.rim_z_mm
-        ):
+        flat_mm = [half + skin.rim_z_mm for half in skin.half_size_mm]
+        if reach_mm > (flat_mm[0] if skin.shape == "round-pad" else math.hypot(*flat_mm)):
             raise ValueError("pins.reach_mm puts pins beyond the flat part of the pad")

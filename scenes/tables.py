@@ -17,16 +17,12 @@ data URI.
 """
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from math import isfinite, prod
 from pathlib import Path
-from typing import TypeAlias
 
 from scenes.base import PICTURE
 from scenes.files import INT64, LARGEST_BYTES, quote, read_regular
-
-Nested: TypeAlias = "int | float | list[Nested] | tuple[Nested, ...]"
-"""A number, or nested lists of numbers, with the same length at each level."""
 
 MOST_INLINE = 120
 """Largest number of numbers in a list that is written to the TOML file itself: about ten lines. A longer list is written to a CSV file."""
@@ -84,22 +80,24 @@ def take_out_tables(section: Mapping[str, object], stem: str, key: str = "") -> 
     key : str
         Dotted name of the section.
     """
+    import numpy as np  # not above, because whoever imports the specifications may need none
+
     kept: dict[str, object] = {}
     texts: dict[str, str] = {}
     for name, value in section.items():
         here = f"{key}.{name}" if key else name
-        shape = _shape(value)
+        table = np.array(value, object)
         if isinstance(value, dict):
             kept[name], more = take_out_tables(value, stem, here)
             texts |= more
         elif isinstance(value, str) and value.startswith(PICTURE):
             kept[name] = {"picture": f"{stem}.{here}{URI}"}
             texts[f"{stem}.{here}{URI}"] = f"{value}\n"
-        elif isinstance(value, list | tuple) and shape is not None and prod(shape) > MOST_INLINE:
+        elif table.size > MOST_INLINE and all(isinstance(n, int | float) and not isinstance(n, bool) for n in table.flat):
             file = f"{stem}.{here}.csv"
-            kept[name] = {"csv": file, "shape": list(shape)}
-            lines = (",".join(f"{significant(number)}" for number in _flat(row)) for row in value)
-            texts[file] = f"# {here}: {' x '.join(map(str, shape))} numbers\n" + "\n".join(lines) + "\n"
+            kept[name] = {"csv": file, "shape": list(table.shape)}
+            lines = (",".join(f"{significant(number)}" for number in row) for row in table.reshape(len(table), -1))
+            texts[file] = f"# {here}: {' x '.join(map(str, table.shape))} numbers\n" + "\n".join(lines) + "\n"
         else:
             kept[name] = value
     return kept, texts
@@ -110,7 +108,9 @@ def significant(number: int | float) -> int | float:
     return float(f"{number:.{DIGITS}g}") if isinstance(number, float) else number
 
 
-def _read_table(reference: Mapping[str, object], folder: Path, key: str) -> list[Nested]:
+def _read_table(reference: Mapping[str, object], folder: Path, key: str) -> list[object]:
+    import numpy as np
+
     file, shape = reference["csv"], reference["shape"]
     if not isinstance(file, str) or not isinstance(shape, list) or not shape or not all(isinstance(n, int) and n > 0 for n in shape):
         raise ValueError(f"{key}: expected {{ csv = 'file name', shape = [numbers above 0] }}, got {dict(reference)}")
@@ -122,16 +122,15 @@ def _read_table(reference: Mapping[str, object], folder: Path, key: str) -> list
     if len(rows) != shape[0]:
         raise ValueError(f"{key}: {file} has {len(rows)} lines of numbers, but shape = {shape} needs {shape[0]}")
     each = prod(shape[1:])
-    table: list[Nested] = []
+    table: list[int | float] = []
     for number, words in rows:
         if len(words) != each:
             raise ValueError(f"{key}: {file}, line {number} has {len(words)} numbers, but shape = {shape} needs {each}")
         try:
-            values = [_number(word) for word in words]
+            table += [_number(word) for word in words]
         except ValueError as error:
             raise ValueError(f"{key}: {file}, line {number}: {quote(error)}; give numbers with commas between them") from None
-        table.append(_fold(values, shape[1:]))
-    return table
+    return list(np.array(table, object).reshape(shape).tolist())
 
 
 def _read_picture(reference: Mapping[str, object], folder: Path, key: str) -> str:
@@ -170,26 +169,3 @@ def _number(word: str) -> int | float:
     if number not in INT64:
         raise ValueError("a whole number has more than 64 bits")
     return number
-
-
-def _fold(values: Sequence[int | float], shape: Sequence[int]) -> Nested:
-    """Numbers in C order as nested lists of a shape; for an empty shape the only number itself."""
-    if not shape:
-        return values[0]
-    each = prod(shape[1:])
-    return [_fold(values[each * k : each * (k + 1)], shape[1:]) for k in range(shape[0])]
-
-
-def _flat(value: Nested) -> list[int | float]:
-    return [number for part in value for number in _flat(part)] if isinstance(value, list | tuple) else [value]
-
-
-def _shape(value: object) -> tuple[int, ...] | None:
-    """Shape of nested lists of numbers; () for a number, None for anything else."""
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        return ()
-    if not isinstance(value, list | tuple):
-        return None
-    shapes = {_shape(part) for part in value}
-    inner = shapes.pop() if len(shapes) == 1 else None
-    return None if inner is None else (len(value), *inner)

@@ -91,6 +91,7 @@ EXTRAS = {
     "mujoco": "mujoco",
     "pyarrow": "records",
     "rerun": "rerun",
+    "rosbags": "records",
     "stable_baselines3": "rl",
     "torch": "models",
     "viser": "studio",

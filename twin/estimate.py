@@ -1,7 +1,7 @@
 """Interface of a trained model: it takes a frame, and returns an estimate with its interval."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -29,7 +29,8 @@ class Estimate(Protocol):
     """An estimator's result on a frame (``training.estimate.estimator.PoseEstimate``)."""
 
     @property
-    def names(self) -> tuple[str, ...]: ...
+    def names(self) -> tuple[str, ...]:
+        """Names of the labels."""
 
     @property
     def units(self) -> tuple[str, ...]: ...
@@ -91,15 +92,20 @@ class PinsFound:
     seen: Observation
     reason: str
     names: tuple[str, ...] = ()
-    units: tuple[str, ...] = ()
+    value: np.ndarray = field(default_factory=lambda: np.zeros(0))
     valid: bool = False
 
     @property
-    def value(self) -> np.ndarray:
-        """No value (0,)."""
-        return np.zeros(0)
+    def units(self) -> tuple[str, ...]:
+        """No units."""
+        return ("",) * len(self.names)
 
-    low = high = value
+    @property
+    def low(self) -> np.ndarray:
+        """NaN, because there are no intervals."""
+        return np.full(len(self.names), np.nan)
+
+    high = low
 
 
 class PinsAlone:

@@ -12,9 +12,10 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError, TwinError
+from twin.estimate import PinsFound
 from twin.pins import Pipeline, Reference, measure_reference, nominal_reference
 from twin.store import ArrayFile, Layers, layers_from, layers_to, through_layers
-from twin.types import BoolArray, FloatArray, Form, Frame, ImageArray, Observation
+from twin.types import BoolArray, FloatArray, Form, Frame, ImageArray
 
 
 class PolicyError(TwinError):
@@ -126,30 +127,11 @@ def flatten(tactile: FloatArray | ImageArray) -> FloatArray:
     return means.reshape(count, -1) / 255.0
 
 
-@dataclass(frozen=True)
-class PolicyAction:
-    """Result of a policy for a frame, for a control loop: an ``Estimate`` whose labels are the axes and whose values are the action."""
+class PolicyAction(PinsFound):
+    """Result of a policy for a frame, for a control loop: an ``Estimate`` whose labels are the axes and whose values are the action.
 
-    names: tuple[str, ...]
-    value: FloatArray
-    valid: bool
-    reason: str
-    seen: Observation
-
-    @property
-    def low(self) -> FloatArray:
-        """NaN, because a policy has no intervals."""
-        return np.full(len(self.names), np.nan)
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        """An action's numbers are shares of their ranges."""
-        return ("",) * len(self.names)
-
-    @property
-    def high(self) -> FloatArray:
-        """NaN, because a policy has no intervals."""
-        return self.low
+    An action's numbers are shares of their ranges, without intervals.
+    """
 
 
 class PolicyModel:
@@ -173,10 +155,8 @@ class PolicyModel:
     counts_from_rest = True
 
     def __init__(self, policy: Policy, *, goal: FloatArray | None = None, contacts: KnownContacts | None = None) -> None:
-        if policy.about["observation"] != "pins":
-            raise PolicyError(
-                f"a policy that sees {policy.about['observation']!r} can't be run on frames; train one with observation 'pins'"
-            )
+        if (seen := policy.about["observation"]) != "pins":
+            raise PolicyError(f"a policy that sees {seen!r} can't be run on frames; train one with observation 'pins'")
         self.policy, self.contacts = policy, contacts
         self.sensor = SensorSpec.model_validate(policy.about["sensor"])
         self.form = Form.PROCESSED if self.sensor.recording else Form.RAW
@@ -207,9 +187,8 @@ class PolicyModel:
     def check(self, sensor: SensorSpec, form: Form) -> None:
         """Raise ``FrameError`` for frames of another sensor or form."""
         if sensor.name != self.sensor.name or form != self.form:
-            raise FrameError(
-                f"the policy was trained for {self.form} frames of '{self.sensor.name}'; these are {form} frames of '{sensor.name}'"
-            )
+            own = f"{self.form} frames of '{self.sensor.name}'"
+            raise FrameError(f"the policy was trained for {own}; these are {form} frames of '{sensor.name}'")
 
     def __call__(self, frame: Frame) -> PolicyAction:
         """The action for a frame. It is not valid if too few pins are found, or if they show a contact that the policy does not know."""
@@ -218,8 +197,8 @@ class PolicyModel:
         if seen.graph is not None:
             moved, reason = self._displacements(seen.graph.nodes_px, np.isnan(seen.pins_px[:, 0]))
         if moved is None or reason:
-            return PolicyAction(self.policy.axes, np.full(len(self.policy.axes), np.nan), False, reason, seen)
+            return PolicyAction(seen, reason, self.policy.axes, np.full(len(self.policy.axes), np.nan))
         count = int(self.policy.about["stack"])
         self._stack = [*(self._stack or [moved] * count), moved][-count:]
         action = self.policy.act(np.array(self._stack)[None], self._goal[None])[0]
-        return PolicyAction(self.policy.axes, action, True, "", seen)
+        return PolicyAction(seen, "", self.policy.axes, action, valid=True)

@@ -17,11 +17,10 @@ from twin.compiled import begin_compiling
 from twin.errors import ContactError, FrameError, OptionError
 from twin.frames.forms import form_named, frame_size
 from twin.frames.images import write_image
-from twin.mechanics.balance import Friction
-from twin.mechanics.batch import ContactJob, press_many
+from twin.mechanics.law import Friction
 from twin.mechanics.newton import GAP_BOUND_MM, RESIDUAL_TOLERANCE
 from twin.mechanics.path import ContactPath, ContactPose
-from twin.mechanics.solver import SkinSolver
+from twin.mechanics.solver import ContactJob, SkinSolver, press_many
 from twin.optics.preview import Shading
 from twin.optics.render import Renderer
 from twin.progress import Progress, silent, stage
@@ -233,13 +232,10 @@ class Simulator:
     def describe(self) -> dict[str, dict[str, object]]:
         """All other parameters of a result besides sensor and object: variant, samples (0 for a rasterised picture), mesh and
         tolerances."""
+        across = self.solver.resolution.across
         return {
             "renderer": {"variant": self.renderer.choice.variant, "samples_per_pixel": self.renderer.spp},
-            "solver": {
-                "elements_across": self.solver.resolution.across,
-                "gap_bound_mm": GAP_BOUND_MM,
-                "residual_tolerance": RESIDUAL_TOLERANCE,
-            },
+            "solver": {"elements_across": across, "gap_bound_mm": GAP_BOUND_MM, "residual_tolerance": RESIDUAL_TOLERANCE},
         }
 
     def check_form(self, form: Form) -> None:

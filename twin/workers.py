@@ -9,14 +9,14 @@ import traceback
 import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from multiprocessing import get_context, parent_process, resource_tracker
 from multiprocessing.connection import Connection, wait
 from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from twin.errors import DatasetError, TwinError, WorkersError, warn_once
+from twin.errors import DatasetError, ErrorsAs, TwinError, WorkersError, warn_once
 from twin.store import fingerprint
 
 if TYPE_CHECKING:
@@ -101,9 +101,8 @@ def in_processes(begin: Begin[Task, Made], given: tuple[object, ...], tasks: Seq
         for process in busy:
             process.end()
     if given_up := [number for number, times in lost.items() if times == TRIES]:
-        raise WorkersError(
-            f"{len(given_up)} of {len(tasks)} tasks ended their process {TRIES} times; is there enough memory for {processes}? {AGAIN}"
-        )
+        ended = f"{len(given_up)} of {len(tasks)} tasks ended their process {TRIES} times"
+        raise WorkersError(f"{ended}; is there enough memory for {processes}? {AGAIN}")
 
 
 class _Process:
@@ -249,11 +248,12 @@ def _client(scheduler: str) -> Iterator["Client"]:
     import dask
     from distributed import Client
 
+    def absent(error: Exception) -> DatasetError:
+        return DatasetError(f"`scheduler` {scheduler}: no scheduler answers there ({error}); start one with 'dask scheduler'")
+
     with dask.config.set({"distributed.comm.timeouts.connect": "10s"}), _silence_dask():
-        try:
+        with ErrorsAs((OSError, ValueError), absent):
             client = Client(scheduler, timeout="10s")
-        except (OSError, ValueError) as error:
-            raise DatasetError(f"`scheduler` {scheduler}: no scheduler answers there ({error}); start one with 'dask scheduler'") from error
         try:
             yield client
         finally:
@@ -264,14 +264,11 @@ def _client(scheduler: str) -> Iterator["Client"]:
 def _silence_dask() -> Iterator[None]:
     """Context without Dask's own log. It reports each lost connection in twenty lines; this program reports it in one."""
     loggers = [logging.getLogger(name) for name in logging.root.manager.loggerDict if name.split(".")[0] == "distributed"]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.CRITICAL + 1)
-    try:
+    with ExitStack() as former:
+        for logger in loggers:
+            former.callback(logger.setLevel, logger.level)
+            logger.setLevel(logging.CRITICAL + 1)
         yield
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
 
 
 def _by_cluster(client: "Client", make: Callable[[str, int], Made], text: str, todo: list[int], scheduler: str) -> Iterator[Made]:
@@ -280,10 +277,9 @@ def _by_cluster(client: "Client", make: Callable[[str, int], Made], text: str, t
     from distributed import wait as wait_for
 
     where = f"scheduler {scheduler}"
-    try:
+    absent = DatasetError(f"{where}: no worker has come within {JOIN_S:g} s; start some with 'dask worker {scheduler}'")
+    with ErrorsAs(TimeoutError, lambda error: absent):
         client.wait_for_workers(1, timeout=JOIN_S)
-    except TimeoutError as error:
-        raise DatasetError(f"{where}: no worker has come within {JOIN_S:g} s; start some with 'dask worker {scheduler}'") from error
     waiting, own = list(reversed(todo)), fingerprint(make)
     flying: dict[Future[Made], int] = {}
     while waiting or flying:

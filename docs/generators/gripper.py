@@ -12,8 +12,7 @@ from PIL import Image
 
 import training.environments  # noqa: F401
 from generators.notebooks import DOCS
-from training.mujoco.grasp import WANTED
-from training.mujoco.task import PERIOD_S
+from training.mujoco.task import PERIOD_S, WANTED
 
 FILM = DOCS / "pictures" / "gripper.webp"
 OBJECT = {"mass_kg": 0.18, "friction": 0.6}

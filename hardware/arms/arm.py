@@ -13,9 +13,10 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
-from hardware.arms.kinematics import FARTHEST, Kinematics, joint_target, linear_target
-from hardware.arms.motion import turn_between_deg
+from hardware.arms.kinematics import FARTHEST, Kinematics, OutOfReachError, finite_numbers
+from hardware.arms.motion import way_between
 from hardware.errors import Connection, DeviceError, StaleDataError, undo
+from twin.errors import ErrorsAs
 
 # Interval in s at which feedback is read. It is shorter than the 8 ms period of the fastest feedback.
 POLL_S = 0.005
@@ -130,11 +131,6 @@ class Arm(Protocol):
         """
 
 
-def stop_after(arm: "Arm | BaseArm", error: BaseException) -> None:
-    """Stop an arm after an error. If the stop fails, this is added to the error."""
-    undo(arm.stop, error)
-
-
 class BaseArm(Connection):
     """Base class of the arms; see ``hardware.arms.arm.Arm`` for the methods."""
 
@@ -170,8 +166,7 @@ class BaseArm(Connection):
             state = self.state()
             if state.error:
                 raise DeviceError(f"{self.name}: {state.error}")
-            off_mm = float(np.linalg.norm(state.pose[:3] - np.asarray(pose)[:3]))
-            off_deg = turn_between_deg(state.pose, np.asarray(pose, float))
+            off_mm, off_deg = way_between(state.pose, np.asarray(pose, float), 6)  # R may differ by full turns
             known, near = state.time_s >= asked_s, off_mm <= tolerance_mm and off_deg <= tolerance_deg
             if known and near and not (at_rest and state.moving):
                 return state
@@ -195,7 +190,7 @@ class BaseArm(Connection):
             yield
         except BaseException as error:
             if self._may_move():
-                stop_after(self, error)
+                undo(self.stop, error)
             raise
 
     @contextmanager
@@ -247,16 +242,26 @@ class KinematicArm(BaseArm):
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         with self._watch_move():
-            sent, joints = linear_target(self.name, self.kinematics, pose)
-            self._move(joints, sent, wait=wait, timeout_s=timeout_s)
+            sent = self.kinematics.nearest_pose(finite_numbers(f"{self.name}: the pose", pose, 6))
+            self._move(self._joints_at(sent), sent, wait=wait, timeout_s=timeout_s)
         return sent
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         with self._watch_move():
-            sent = joint_target(self.name, joints_deg, self.axes)
+            sent = finite_numbers(f"{self.name}: the joint angles", joints_deg, self.axes)
             self._move(sent, None, wait=wait, timeout_s=timeout_s)
         return sent
 
     @abstractmethod
     def _move(self, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float) -> None:
         """Move along a line to ``pose`` (6,), where the joints (J,) are these, or, without a pose, move the joints there."""
+
+    def _joints_at(self, pose: np.ndarray) -> np.ndarray:
+        """Joints (J,) at a pose (6,); ``DeviceError`` if it is out of reach."""
+        with ErrorsAs(OutOfReachError, lambda error: DeviceError(f"{self.name}: {error}; nothing was sent")):
+            return self.kinematics.inverse(pose)
+
+    def _require_within(self, joints_deg: np.ndarray) -> None:
+        """Raise ``DeviceError`` unless the joints (J,) are within the limits."""
+        if violation := self.kinematics.violation(joints_deg):
+            raise DeviceError(f"{self.name}: {violation.text}; nothing was sent. Choose a target within reach and limits")

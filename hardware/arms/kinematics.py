@@ -12,7 +12,6 @@ import numpy as np
 
 from hardware.errors import DeviceError
 from scenes.files import quote
-from twin.errors import ErrorsAs
 
 # Numbers of the Dobots' alarms that planning raises (see ``hardware.arms.dobot_alarms``).
 NO_INVERSE, TARGET_LIMIT, LINE_LEAVES_WORKSPACE = 17, 18, 23
@@ -149,27 +148,3 @@ def finite_numbers(what: str, given: np.ndarray, count: int) -> np.ndarray:
     if not (np.abs(numbers) < FARTHEST).all():
         raise DeviceError(f"{what} {quote(repr(given))} is farther than any arm reaches; give mm and deg")
     return numbers
-
-
-def linear_target(name: str, kinematics: Kinematics, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The pose (6,) nearest to the requested one that the arm can take, and its joints (J,).
-
-    Raises
-    ------
-    DeviceError
-        The pose is not six finite numbers, or out of reach.
-    """
-    sent = kinematics.nearest_pose(finite_numbers(f"{name}: the pose", pose, 6))
-    with ErrorsAs(OutOfReachError, lambda error: DeviceError(f"{name}: {error}; nothing was sent")):
-        return sent, kinematics.inverse(sent)
-
-
-def joint_target(name: str, joints_deg: np.ndarray, axes: int) -> np.ndarray:
-    """Joint angles (J,), or ``DeviceError`` if they are not a finite number for each of the arm's axes."""
-    return finite_numbers(f"{name}: the joint angles", joints_deg, axes)
-
-
-def require_possible(name: str, kinematics: Kinematics, joints_deg: np.ndarray) -> None:
-    """Raise ``DeviceError`` unless the joints (J,) are within the limits."""
-    if violation := kinematics.violation(joints_deg):
-        raise DeviceError(f"{name}: {violation.text}; nothing was sent. Choose a target within reach and limits")

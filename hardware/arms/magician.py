@@ -13,9 +13,9 @@ from serial.tools import list_ports
 from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, KinematicArm
 from hardware.arms.awake import awake_s
 from hardware.arms.dobot_alarms import explain
-from hardware.arms.kinematics import MAGICIAN, LinkageKinematics, require_possible
+from hardware.arms.kinematics import MAGICIAN, LinkageKinematics
 from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
-from hardware.arms.supervisor import Supervisor, supervise_connection
+from hardware.arms.supervisor import Supervisor
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 from twin.errors import ErrorsAs
 
@@ -41,6 +41,11 @@ INDEX_BYTES = 8
 ACCELERATION = 4.0
 
 
+def attached_ports() -> list[str]:
+    """The ports of attached USB adapters of a Magician's kind."""
+    return [port.device for port in list_ports.comports() if port.vid in USB_VENDORS]
+
+
 class Magician(KinematicArm):
     """A Dobot Magician.
 
@@ -61,7 +66,7 @@ class Magician(KinematicArm):
 
     def __init__(self, port: str, *, tool_x_mm: float = 0.0, supervised: bool = True) -> None:
         self._supervised = supervised
-        self._supervisor: Supervisor | None = None
+        self._supervisor = Supervisor()
         self.name, self._port_name = f"Magician at {port}", port
         self.kinematics = replace(MAGICIAN, r0_mm=tool_x_mm)
         self._serial: serial.Serial | None = None
@@ -80,10 +85,9 @@ class Magician(KinematicArm):
         try:
             self._serial = serial.Serial(self._port_name, BAUD, timeout=0.05, write_timeout=REPLY_TIMEOUT_S, exclusive=True)
         except PORT_ERRORS as error:
-            attached = [port.device for port in list_ports.comports() if port.vid in USB_VENDORS]
             raise DeviceNotConnectedError(
-                f"{self.name}: can't open the port ({error}); Magicians attached: {', '.join(attached) or 'none'}. Plug in the USB cable "
-                "and switch the arm on; on Linux the user must be in the group 'dialout'; and no other program may hold the port; "
+                f"{self.name}: can't open the port ({error}); Magicians attached: {', '.join(attached_ports()) or 'none'}. Plug in the USB "
+                "cable and switch the arm on; on Linux the user must be in the group 'dialout'; and no other program may hold the port; "
                 "without an arm: 'twin emulate magician'"
             ) from error
         try:
@@ -105,19 +109,14 @@ class Magician(KinematicArm):
         self._request(Id.PTP_COMMON_PARAMS, struct.pack("<2f", 100.0, 100.0), ctrl=WRITE)
         self._forget_queue()
         self._request(Id.QUEUE_START, ctrl=WRITE)
-        if self._supervised and self._supervisor is None:
-            self._supervisor = supervise_connection(self._port().fileno, LAST_WORDS)
+        if self._supervised and not self._enabled:
+            self._supervisor = Supervisor(self._port().fileno, LAST_WORDS)
         self._enabled = True
 
     def disable(self) -> None:
         self.stop()
         self._enabled = False
-        self._unsupervise()
-
-    def _unsupervise(self) -> None:
-        supervisor, self._supervisor = self._supervisor, None
-        if supervisor is not None:
-            supervisor.end()
+        self._supervisor.end()
 
     def clear_error(self) -> None:
         self._forget_queue()
@@ -167,7 +166,7 @@ class Magician(KinematicArm):
 
     def _move(self, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float) -> None:
         self._require_enabled()
-        require_possible(self.name, self.kinematics, joints)
+        self._require_within(joints)
         if alarms := self._alarms():
             raise DeviceError(f"{self.name}: {explain(alarms)}")
         begun_s = time.monotonic()
@@ -274,7 +273,7 @@ class Magician(KinematicArm):
         return None
 
     def _close(self) -> None:
-        self._unsupervise()
+        self._supervisor.end()
         if self._serial is not None:
             with contextlib.suppress(*PORT_ERRORS):
                 self._serial.close()

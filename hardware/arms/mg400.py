@@ -9,24 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from hardware.arms import kinematics as arms
+from hardware.arms import mg400_wire as wire
 from hardware.arms.arm import POLL_S, ArmState, KinematicArm
 from hardware.arms.dobot_alarms import explain
-from hardware.arms.kinematics import LinkageKinematics, require_possible
+from hardware.arms.kinematics import LinkageKinematics
 from hardware.arms.mg400_link import REPLY_TIMEOUT_S, SILENCE_S, CommandPort, Feedback, NoReplyError
-from hardware.arms.mg400_wire import (
-    DASHBOARD_PORT,
-    DEFAULT_HOSTS,
-    FEEDBACK_PERIOD_S,
-    MAX_JOINT_DEG_S,
-    MAX_LINEAR_MM_S,
-    MOTION_PORT,
-    ErrorId,
-    Mode,
-    Reply,
-    pose_in,
-    require_ports,
-    why_refused,
-)
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
 LOG = logging.getLogger(__name__)
@@ -49,8 +36,8 @@ MUTE_S, STOP_AGAIN_S = 3.0, 0.08
 # Least time, s, that feedback has to confirm a move: two periods of the slower of the two used ports.
 SETTLE_S = 0.5
 # Modes of an enabled arm, and of a moving arm. All decisions about this use the feedback's mode, and no other field.
-ENABLED_MODES = {Mode.ENABLED, Mode.BACKDRIVE, Mode.RUNNING, Mode.RECORDING, Mode.PAUSE, Mode.JOG}
-MOVING_MODES = {Mode.RUNNING, Mode.JOG}
+ENABLED_MODES = {wire.Mode.ENABLED, wire.Mode.BACKDRIVE, wire.Mode.RUNNING, wire.Mode.RECORDING, wire.Mode.PAUSE, wire.Mode.JOG}
+MOVING_MODES = {wire.Mode.RUNNING, wire.Mode.JOG}
 PAUSED = "paused by another client; stop() drops the queue, Continue() of that client would execute it"
 DISABLED = "was disabled by another program or at its button; call enable() when nobody else uses it"
 # Requests that stop and disable the arm if this program dies.
@@ -65,13 +52,13 @@ RESTED_S = 0.05
 class Mg400Ports:
     """Ports on which the arm listens; the feedback ports are tried in order."""
 
-    dashboard: int = DASHBOARD_PORT
-    motion: int = MOTION_PORT
-    feedback: tuple[int, ...] = tuple(FEEDBACK_PERIOD_S)[:2]
+    dashboard: int = wire.DASHBOARD_PORT
+    motion: int = wire.MOTION_PORT
+    feedback: tuple[int, ...] = tuple(wire.FEEDBACK_PERIOD_S)[:2]
 
     def shift_ports(self, offset: int) -> "Mg400Ports":
         """The same ports, shifted by an offset."""
-        require_ports(offset)
+        wire.require_ports(offset)
         return Mg400Ports(self.dashboard + offset, self.motion + offset, tuple(port + offset for port in self.feedback))
 
 
@@ -97,7 +84,7 @@ class MG400(KinematicArm):
 
     def __init__(
         self,
-        host: str = DEFAULT_HOSTS["LAN1"],
+        host: str = wire.DEFAULT_HOSTS["LAN1"],
         *,
         ports: Mg400Ports = Mg400Ports(),  # noqa: B008  (frozen)
         kinematics: LinkageKinematics = arms.MG400,
@@ -145,7 +132,7 @@ class MG400(KinematicArm):
 
     def enable(self) -> None:
         self._require_connected()
-        if self._mode() == Mode.ERROR:
+        if self._mode() == wire.Mode.ERROR:
             raise DeviceError(f"{self.name}: {self._alarm()}")
         if self._mode() in ENABLED_MODES and not self._enabled:
             LOG.warning(
@@ -173,7 +160,8 @@ class MG400(KinematicArm):
         with contextlib.suppress(DeviceError):
             self._ask("ResetRobot()")
         self._ask("ClearError()")
-        self._await_mode(lambda mode: mode != Mode.ERROR, "the alarm remains; remove its cause (release the emergency stop, free the arm)")
+        remains = "the alarm remains; remove its cause (release the emergency stop, free the arm)"
+        self._await_mode(lambda mode: mode != wire.Mode.ERROR, remains)
         self._alarm_text = None
 
     def stop(self) -> None:
@@ -215,10 +203,10 @@ class MG400(KinematicArm):
     def state(self, *, max_age_s: float = SILENCE_S) -> ArmState:
         self._require_connected()
         packet, time_s = self._feedback.newest(max_age_s)
-        pose = pose_in(packet)
+        pose = wire.pose_in(packet)
         self._require_possible(pose)
         mode = int(packet["mode"])
-        if mode != Mode.ERROR:
+        if mode != wire.Mode.ERROR:
             self._alarm_text = None
         return ArmState(
             pose,
@@ -231,11 +219,11 @@ class MG400(KinematicArm):
 
     def _trouble(self, mode: int) -> str:
         """The arm's fault in a mode, in words; "" if there is none."""
-        if mode == Mode.ERROR:
+        if mode == wire.Mode.ERROR:
             return self._alarm()
-        if mode == Mode.PAUSE:
+        if mode == wire.Mode.PAUSE:
             return PAUSED
-        return DISABLED if mode == Mode.DISABLED and self._enabled else ""
+        return DISABLED if mode == wire.Mode.DISABLED and self._enabled else ""
 
     def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
         """The arm takes whole percents of its largest speed. A speed below 1 % becomes 1 %.
@@ -243,7 +231,7 @@ class MG400(KinematicArm):
         In a linear move the turn may also reach the given angular speed, even if the move is short.
         """
         self._require_speeds(linear_mm_s, angular_deg_s)
-        self.set_speed_percent(linear=100 * linear_mm_s / MAX_LINEAR_MM_S, angular=100 * angular_deg_s / MAX_JOINT_DEG_S)
+        self.set_speed_percent(linear=100 * linear_mm_s / wire.MAX_LINEAR_MM_S, angular=100 * angular_deg_s / wire.MAX_JOINT_DEG_S)
         self._speed = linear_mm_s, angular_deg_s
 
     def set_speed_percent(self, *, linear: float | None = None, angular: float | None = None, overall: float | None = None) -> None:
@@ -276,16 +264,16 @@ class MG400(KinematicArm):
         state = self.state()
         start = self._sent if self._sent is not None and state.moving else state.pose
         length_mm, turn_deg = float(np.linalg.norm(pose[:3] - start[:3])), abs(pose[5] - start[5])
-        if length_mm > SHORT_MM or turn_deg / MAX_JOINT_DEG_S <= length_mm / MAX_LINEAR_MM_S:
+        if length_mm > SHORT_MM or turn_deg / wire.MAX_JOINT_DEG_S <= length_mm / wire.MAX_LINEAR_MM_S:
             return ""
         wanted_s = max(length_mm / self._speed[0], turn_deg / self._speed[1])
-        return f",SpeedL={int(np.clip(np.floor(100 * turn_deg / MAX_JOINT_DEG_S / wanted_s + 1e-9), 1, 100))}"
+        return f",SpeedL={int(np.clip(np.floor(100 * turn_deg / wire.MAX_JOINT_DEG_S / wanted_s + 1e-9), 1, 100))}"
 
     def _move(self, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float) -> None:
         self._require_connected()
-        require_possible(self.name, self.kinematics, joints)
+        self._require_within(joints)
         packet, _ = self._feedback.newest(SILENCE_S)  # checked here, because old firmware does not report a refusal
-        if int(packet["mode"]) == Mode.ERROR:
+        if int(packet["mode"]) == wire.Mode.ERROR:
             raise DeviceError(f"{self.name}: {self._alarm()}")
         if int(packet["mode"]) not in ENABLED_MODES:
             raise DeviceError(f"{self.name}: {DISABLED if self._enabled else 'not enabled; call enable() first'}")
@@ -323,7 +311,7 @@ class MG400(KinematicArm):
             self._bare, self._late_replies = True, False
             return
         self._late_replies = False
-        if reply.error_id == ErrorId.FAILED and self._shows(lambda packet: int(packet["mode"]) == Mode.ERROR, within_s=ALARM_S):
+        if reply.error_id == wire.ErrorId.FAILED and self._shows(lambda packet: int(packet["mode"]) == wire.Mode.ERROR, within_s=ALARM_S):
             raise DeviceError(f"{self.name}: {self._alarm()}")  # the alarm appeared only now
         self._check(text, reply)
 
@@ -396,14 +384,14 @@ class MG400(KinematicArm):
             kind = DeviceNotConnectedError if isinstance(error, DeviceNotConnectedError) else DeviceError
             raise kind(f"{self.name}: can't be {what} and may move. Press its emergency stop! {error}") from error
 
-    def _ask(self, request: str, *, timeout_s: float = REPLY_TIMEOUT_S) -> Reply:
+    def _ask(self, request: str, *, timeout_s: float = REPLY_TIMEOUT_S) -> wire.Reply:
         reply = self._dashboard.request(request, timeout_s=timeout_s)
         self._check(request, reply)
         return reply
 
-    def _check(self, request: str, reply: Reply) -> None:
+    def _check(self, request: str, reply: wire.Reply) -> None:
         if reply.error_id:
-            raise DeviceError(f"{self.name}: {why_refused(reply.error_id, request)}")
+            raise DeviceError(f"{self.name}: {wire.why_refused(reply.error_id, request)}")
 
     def _close(self) -> None:
         self._in_use = self._under_way = self._late_replies = self._unstopped = self._enabled = False

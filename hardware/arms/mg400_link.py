@@ -11,7 +11,7 @@ import numpy as np
 from hardware.arms.arm import FEEDBACK_AGE_S
 from hardware.arms.awake import awake_s
 from hardware.arms.mg400_wire import PACKET_BYTES, Reply, describe_bytes, newest_packet, take_reply, why_no_packet
-from hardware.arms.supervisor import Supervisor, supervise_connection
+from hardware.arms.supervisor import Supervisor
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
 # Longest wait for a connection, in s.
@@ -45,7 +45,7 @@ class CommandPort:
         self._lock, self._buffer = RLock(), ""
         self._heard = False  # whether anything came from this address
         self._last_words: tuple[bytes, ...] = ()
-        self._supervisor: Supervisor | None = None
+        self._supervisor = Supervisor()
 
     @property
     def is_open(self) -> bool:
@@ -73,15 +73,13 @@ class CommandPort:
         """
         with self._lock:
             self._last_words = last_words
-            if self._supervisor is not None:
-                self._supervisor.end()
-            self._supervisor = supervise_connection(self._socket.fileno, last_words) if self._socket is not None and last_words else None
+            self._supervisor.end()
+            if self._socket is not None:
+                self._supervisor = Supervisor(self._socket.fileno, last_words)
 
     def close(self) -> None:
         with self._lock:
-            if self._supervisor is not None:
-                self._supervisor.end()
-                self._supervisor = None
+            self._supervisor.end()
             if self._socket is not None:
                 self._socket.close()
             self._socket, self._buffer = None, ""
@@ -175,12 +173,6 @@ class Feedback:
         Tried in order.
     lenient : bool
         Whether packets count whatever their test value is.
-
-    Attributes
-    ----------
-    skipped_bytes : int
-        Bytes that did not belong to a whole, valid packet.
-    reconnects : int
     """
 
     def __init__(self, name: str, host: str, ports: tuple[int, ...], *, lenient: bool = False) -> None:

@@ -162,14 +162,8 @@ _FIELDS = {  # name: (format, offset)
     "target_quaternion": (("<f8", (4,)), 1352),
     "actual_quaternion": (("<f8", (4,)), 1384),
 }
-PACKET = np.dtype(
-    {
-        "names": list(_FIELDS),
-        "formats": [form for form, _ in _FIELDS.values()],
-        "offsets": [offset for _, offset in _FIELDS.values()],
-        "itemsize": PACKET_BYTES,
-    }
-)
+_FORMATS, _OFFSETS = zip(*_FIELDS.values(), strict=True)
+PACKET = np.dtype({"names": list(_FIELDS), "formats": _FORMATS, "offsets": _OFFSETS, "itemsize": PACKET_BYTES})
 
 
 def pose_in(packet: np.void) -> np.ndarray:

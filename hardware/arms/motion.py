@@ -164,25 +164,20 @@ class MotionTrack:
             broken = check_line(self.kinematics, start, end) if linear else self.kinematics.violation(end)
             if broken:
                 return broken
-            length, turn = _lengths(self.kinematics, start, end, linear)
-            times = [
-                travel_time_s(length, speeds.linear_mm_s, speeds.linear_mm_s2),
-                travel_time_s(turn, speeds.angular_deg_s, speeds.angular_deg_s2),
-            ]
+            rates = (speeds.linear_mm_s, speeds.linear_mm_s2), (speeds.angular_deg_s, speeds.angular_deg_s2)
+            lengths = way_between(start, end, self.kinematics.axes) if linear else (0.0, float(np.abs(end - start).max()))
+            times = [travel_time_s(length, *rate) for length, rate in zip(lengths, rates, strict=True)]
             slowest = int(np.argmax(times))
-            speed = (speeds.linear_mm_s, speeds.angular_deg_s)[slowest]
-            acceleration = (speeds.linear_mm_s2, speeds.angular_deg_s2)[slowest]
+            speed, acceleration = rates[slowest]
             ramp = min(0.5, speed / acceleration / times[slowest]) if times[slowest] > 0 else 0.0
-            piece = Piece(self.kinematics, start, end, linear, begins_s, times[slowest], ramp)
-            self._pieces.append(piece)
-            return piece
+            self._pieces.append(Piece(self.kinematics, start, end, linear, begins_s, times[slowest], ramp))
+            return self._pieces[-1]
 
     def dwell(self, duration_s: float, *, now_s: float) -> Piece:
         """Append a time in which the arm rests at the end of the last piece."""
         with self._lock:
-            last = self._pieces[-1]
-            begins_s = max(now_s, last.end_s)
-            joints = last.joints_deg(begins_s)
+            begins_s = max(now_s, self.end_s)
+            joints = self._pieces[-1].joints_deg(begins_s)
             self._pieces.append(Piece(self.kinematics, joints, joints, False, begins_s, duration_s, 0.0))
             return self._pieces[-1]
 
@@ -199,12 +194,10 @@ class MotionTrack:
             return next((piece for piece in reversed(self._pieces) if piece.start_s <= time_s), self._pieces[0])
 
 
-def _lengths(kinematics: Kinematics, start: np.ndarray, end: np.ndarray, linear: bool) -> tuple[float, float]:
-    """Length of the path in mm and in deg."""
-    if not linear:
-        return 0.0, float(np.abs(end - start).max())
-    turn = turn_between_deg(start, end) if kinematics.axes == 6 else abs(end[5] - start[5])
-    return float(np.linalg.norm(end[:3] - start[:3])), float(turn)
+def way_between(start: np.ndarray, end: np.ndarray, axes: int) -> tuple[float, float]:
+    """Length, mm, and turn, deg, of a straight move between two poses (6,). R of an arm of four axes is not wrapped."""
+    turn_deg = float(abs(end[5] - start[5])) if axes == 4 else turn_between_deg(start, end)
+    return float(np.linalg.norm(end[:3] - start[:3])), turn_deg
 
 
 def turn_between_deg(a: np.ndarray, b: np.ndarray) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 
 from hardware.arms.arm import Arm
 from hardware.arms.kinematics import Kinematics, StageKinematics
-from hardware.arms.motion import between, turn_between_deg
+from hardware.arms.motion import between, way_between
 from hardware.errors import DeviceError
 
 # Longest duration of a piece, in s. It is also the longest delay until the arm turns to a newer target.
@@ -123,5 +123,5 @@ class NewestTarget:
 
     def _takes_s(self, start: np.ndarray, end: np.ndarray) -> float:
         """Duration in s of a straight move at full speed."""
-        turn_deg = abs(end[5] - start[5]) if self._arm.axes == 4 else turn_between_deg(start, end)
-        return max(float(np.linalg.norm(end[:3] - start[:3])) / self._speed[0], turn_deg / self._speed[1])
+        way_mm, turn_deg = way_between(start, end, self._arm.axes)
+        return max(way_mm / self._speed[0], turn_deg / self._speed[1])

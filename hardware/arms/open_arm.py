@@ -1,7 +1,7 @@
 """Makes an arm of any kind from its specification: ``open_arm("mg400:192.168.1.6")``."""
 
 from hardware.arms.arm import Arm
-from hardware.arms.magician import Magician
+from hardware.arms.magician import Magician, attached_ports
 from hardware.arms.magician_wire import USB_VENDORS
 from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.arms.mg400_wire import DEFAULT_HOSTS, address_of
@@ -36,7 +36,7 @@ def open_arm(spec: str) -> Arm:
     """
     kind, _, rest = spec.partition(":")
     if kind == "simulated" and rest in ("", "4", "6"):
-        return SimulatedArm(axes=int(rest or 6), name=f"simulated arm of {rest or 6} axes")
+        return SimulatedArm(axes=int(rest or 6))
     if kind in ("mg400", "mg400-lenient"):
         host, offset = address_of(rest)
         return MG400(host or DEFAULT_HOSTS["LAN1"], ports=Mg400Ports().shift_ports(offset), lenient=kind == "mg400-lenient")
@@ -59,9 +59,7 @@ def kind_of(spec: str) -> str:
 
 
 def _attached_magician() -> str:
-    from serial.tools import list_ports
-
-    found = [port.device for port in list_ports.comports() if port.vid in USB_VENDORS]
+    found = attached_ports()
     if len(found) != 1:
         raise DeviceError(
             f"{'no' if not found else len(found)} serial adapters of a Magician's kind ({', '.join(USB_VENDORS.values())}) are attached: "

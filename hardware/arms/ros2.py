@@ -17,13 +17,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, BaseArm
-from hardware.arms.kinematics import StageKinematics, finite_numbers, joint_target
+from hardware.arms.kinematics import StageKinematics, finite_numbers
 from hardware.arms.motion import MotionTrack, Speeds
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 from hardware.ros2.dds import Participant, Reader, Writer, domain_id
 from scenes.files import quote
 from twin.errors import ErrorsAs
-from twin.records import ros2_messages as ros
+from twin.records import ros2 as ros
 from twin.rig.arm_pose import matrix_of, pose_of
 
 LOG = logging.getLogger(__name__)
@@ -207,7 +207,7 @@ class Ros2Arm(BaseArm):
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         """Always an error: the topics command the tool, and not the joints."""
         self._require_connected()
-        joint_target(self.name, joints_deg, self.axes)
+        finite_numbers(f"{self.name}: the joint angles", joints_deg, self.axes)
         raise DeviceError(f"{self.name}: its joints can't be moved by these topics; use move_linear")
 
     def _hold(self, why: str = "", *, known: bool = True) -> None:

@@ -24,16 +24,12 @@ class SimulatedArm(KinematicArm):
     """
 
     def __init__(
-        self,
-        *,
-        axes: int = 6,
-        pose: Sequence[float] | np.ndarray = (300.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-        time_scale: float = 1.0,
-        name: str = "simulated arm",
+        self, *, axes: int = 6, pose: Sequence[float] | np.ndarray = (300.0, 0.0, 0.0, 0.0, 0.0, 0.0), time_scale: float = 1.0
     ) -> None:
         if axes not in (4, 6):
             raise DeviceError(f"a simulated arm has 4 or 6 axes, not {axes}")
-        self.name, self.axes, self.kinematics = name, axes, StageKinematics() if axes == 6 else MG400
+        self.name, self.axes = f"simulated arm of {axes} axes", axes
+        self.kinematics = StageKinematics() if axes == 6 else MG400
         self.track = MotionTrack(self.kinematics, self.kinematics.inverse(np.asarray(pose, float)))
         self._speeds, self._scale = Speeds(100.0, 100.0, 1000.0, 1000.0), time_scale
         self._connected = self._enabled = False

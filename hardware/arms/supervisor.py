@@ -18,33 +18,32 @@ CHECK_S, MESSAGE_S = 0.05, 0.15
 END_S = 2.0
 
 
-def supervise_connection(fileno: Callable[[], int], messages: tuple[bytes, ...]) -> "Supervisor | None":
-    """Start a supervisor of the connection with this descriptor; None on Windows, where processes inherit no descriptors."""
-    return Supervisor(fileno(), messages) if hasattr(os, "fork") else None
-
-
 class Supervisor:
-    """Sends messages on a connection if this program ends without ``end``.
+    """Sends messages on a connection if this program ends without ``end``. Not on Windows, where processes inherit no descriptors.
 
     Parameters
     ----------
-    descriptor : int
-        File descriptor of the connection, a socket or a serial port.
+    fileno : callable
+        Gives the file descriptor of the connection, a socket or a serial port.
     messages : tuple of bytes
-        What stops and disables the arm.
+        What stops and disables the arm; without any there is no supervisor.
     """
 
-    def __init__(self, descriptor: int, messages: tuple[bytes, ...]) -> None:
-        command = [sys.executable, "-I", "-S", __file__, str(descriptor), str(os.getpid()), *(message.hex() for message in messages)]
-        quiet = subprocess.DEVNULL
-        self._process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet, pass_fds=(descriptor,), start_new_session=True
-        )
+    def __init__(self, fileno: Callable[[], int] = lambda: -1, messages: tuple[bytes, ...] = ()) -> None:
+        self._process: subprocess.Popen | None = None
+        if messages and hasattr(os, "fork"):
+            descriptor, quiet = fileno(), subprocess.DEVNULL
+            command = [sys.executable, "-I", "-S", __file__, str(descriptor), str(os.getpid()), *(message.hex() for message in messages)]
+            self._process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet, pass_fds=(descriptor,), start_new_session=True
+            )
 
     def end(self) -> None:
         """End the process. It sends nothing."""
-        with contextlib.suppress(OSError, subprocess.TimeoutExpired):
-            self._process.communicate(b"end", timeout=END_S)
+        process, self._process = self._process, None
+        if process is not None:
+            with contextlib.suppress(OSError, subprocess.TimeoutExpired):
+                process.communicate(b"end", timeout=END_S)
 
 
 def supervise(descriptor: int, program: int, messages: list[bytes]) -> None:

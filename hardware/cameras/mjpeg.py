@@ -1,23 +1,50 @@
-"""A camera that is read over HTTP: a stream of JPEGs or PNGs (multipart/x-mixed-replace), or the address of a single picture."""
+"""Pictures over HTTP: how JPEGs and PNGs are coded, streams of them (multipart/x-mixed-replace), a camera that sends them, and a server.
+
+The camera sends a stream, or is the address of a single picture. The server sends the newest picture as a stream, and on a page with a line
+of text above it.
+"""
 
 import contextlib
 import http.client
 import re
 import socket
+import threading
 import time
 import urllib.request
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from io import BufferedIOBase
 from urllib.error import HTTPError, URLError
 from urllib.parse import unquote, urlsplit
 
+import cv2
+import numpy as np
+
 from hardware.cameras import reader
-from hardware.cameras.coded import Parts, decode_picture, on_own_clock
 from hardware.cameras.reader import DevicePicture, LiveSource, ReadFailed, TornPicture
-from hardware.errors import DeviceError
+from hardware.errors import DeviceError, cannot_listen
 from scenes.files import quote
 from scenes.sensor import SensorSpec
-from twin.errors import ErrorsAs
+from twin.errors import ErrorsAs, FrameError
+from twin.frames.images import picture_of
 from twin.types import Form
 
+BOUNDARY = "frame"
+CONTENT_TYPE = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
+# Quality (0 to 100) of the JPEGs that are written.
+JPEG_QUALITY = 95
+# Largest accepted picture, in bytes.
+LARGEST_PART = 32_000_000
+# Most bytes of a line of a part's headers.
+LONGEST_HEADER = 65_536
+# Largest difference, s, between a time stamp and the present time. A time stamp with a larger difference is of another clock and not used.
+CLOCK_SLACK_S = 60.0
+# First bytes of a JPEG and of a PNG, and the last bytes of a PNG.
+JPEG, PNG, PNG_END = b"\xff\xd8", b"\x89PNG\r\n\x1a\n", b"IEND\xae\x42\x60\x82"
+# Second bytes of a JPEG's markers: start and end of a picture, start of a scan, those without content, and those inside a scan.
+_START, _END, _SCAN = 0xD8, 0xD9, 0xDA
+_BARE, _IN_SCAN = (0x01, *range(0xD0, 0xD9)), (0x00, *range(0xD0, 0xD8), 0xFF)
 # Time, s, without a byte after which a read has failed.
 SILENT_S = 2.0
 # Pause, s, after which the address of a single picture is asked again.
@@ -33,6 +60,144 @@ REMEDIES = {
     404: "it has no such page; look up the path of the stream in the camera's manual",
     503: "it is busy or not ready; end what else uses the camera, and try again",
 }
+WAIT_S = 0.5
+"""Interval in s at which a connection without new pictures checks whether the server has ended."""
+HELD_BYTES = 16_384
+"""Bytes in the send buffer of a connection, so that a client that pauses gets few old pictures, and then the newest. The kernel doubles the
+number, and the client has its own buffer."""
+STREAM = "/stream.mjpg"
+LINE = "/line"
+PAGE = f"""<!doctype html><meta charset=utf-8><meta name=viewport content="width=device-width,initial-scale=1"><title>Camera</title>
+<body style="margin:0;background:#222;color:#fff;text-align:center;font:1.4rem sans-serif">
+<p id=line role=status style="margin:.5rem;min-height:2.4em"></p>
+<img src="{STREAM}" style="width:100%;height:calc(100vh - 5rem);object-fit:contain;object-position:top" alt="the camera's picture">
+<script>setInterval(async () => {{ try {{ line.textContent = await (await fetch("{LINE}")).text() }}
+catch {{ line.textContent = "The recording has ended." }} }}, 250)</script>"""
+
+
+def jpeg_of(image: np.ndarray, quality: int = JPEG_QUALITY) -> bytes:
+    """A gray (H, W) or RGB (H, W, 3) picture as JPEG."""
+    _, coded = cv2.imencode(".jpg", image if image.ndim == 2 else image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return coded.tobytes()
+
+
+def write_part(out: BufferedIOBase, jpeg: bytes, headers: dict[str, object] | None = None) -> None:
+    """Write one picture of a stream; raises ``OSError`` if the client is gone."""
+    more = "".join(f"{name}: {value}\r\n" for name, value in (headers or {}).items())
+    head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n{more}\r\n"
+    out.write(head.encode("ascii") + jpeg + b"\r\n")
+
+
+def picture_end(data: bytes | bytearray) -> int:
+    """Number of bytes of the picture with which ``data`` begins; 0 if it is not whole.
+
+    A JPEG's end is found by its segments, because its thumbnail has an end of its own.
+    """
+    if data.startswith(PNG):
+        return data.find(PNG_END) + len(PNG_END) if PNG_END in data else 0
+    at, scan = 2, False
+    while data.startswith(JPEG):
+        at = data.find(0xFF, at)
+        if at < 0 or at + 1 >= len(data):
+            return 0
+        marker = data[at + 1]
+        if marker == _END:
+            return at + 2
+        if marker == _START:  # the next picture
+            return 0
+        if scan and marker in _IN_SCAN or marker in _BARE:
+            at += 1 if marker == 0xFF else 2
+            continue
+        if at + 3 >= len(data):
+            return 0
+        at, scan = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big"), marker == _SCAN
+    return 0
+
+
+def decode_picture(data: bytes) -> tuple[np.ndarray, str]:
+    """A JPEG or PNG as gray (H, W) or RGB (H, W, 3) uint8, and a note as of ``picture_of``.
+
+    An incomplete or damaged one raises ``TornPicture``, because decoders guess the rest.
+    """
+    kind = "JPEG" if data.startswith(JPEG) else "PNG" if data.startswith(PNG) else ""
+    if not kind:
+        raise TornPicture(f"{len(data)} bytes that are neither a JPEG nor a PNG")
+    if not (end := picture_end(data)):
+        raise TornPicture(f"an incomplete {kind} ({len(data)} bytes, without its end)")
+    with ErrorsAs(FrameError, lambda error: TornPicture(f"a damaged {kind}: {error}")):
+        return picture_of(data[:end])
+
+
+class Parts:
+    """The parts of a multipart stream, with or without ``Content-Length``, whatever its boundary is.
+
+    Parameters
+    ----------
+    read : callable
+        Gives the next bytes of the stream, as soon as there are any; none at its end.
+    """
+
+    def __init__(self, read: Callable[[], bytes]) -> None:
+        self._read, self._data, self._boundary = read, bytearray(), b""
+
+    def next_part(self) -> tuple[dict[str, str], bytes]:
+        """Headers (lower case) and picture of the next part.
+
+        A part ends with its picture, so that it is there before the next one begins; a part that is no whole picture ends at the boundary.
+
+        Raises
+        ------
+        EOFError
+            The stream has ended.
+        """
+        headers: dict[str, str] = {}
+        begun = False
+        while True:
+            line = self._line()
+            if line.startswith(b"--") and not begun:
+                if self._boundary and line == self._boundary + b"--":
+                    raise EOFError("the stream ended")
+                begun, self._boundary = True, self._boundary or line
+            name, colon, value = line.decode("latin-1").partition(":")
+            if colon:
+                headers[name.strip().lower()] = value.strip()
+            elif begun and not line:
+                return headers, self._body()
+
+    def _line(self) -> bytes:
+        while (end := self._data.find(b"\n")) < 0:
+            if len(self._data) > LONGEST_HEADER:
+                raise EOFError(f"{LONGEST_HEADER} bytes without a line of headers")
+            self._fill("")
+        line = bytes(self._data[:end]).strip()
+        del self._data[: end + 1]
+        return line
+
+    def _body(self) -> bytes:
+        while True:
+            end = picture_end(self._data)
+            next_one = self._data.find(b"\n" + self._boundary)
+            if not end and next_one >= 0:
+                end = next_one + 1
+            if end:
+                body = bytes(self._data[:end])
+                del self._data[:end]
+                return body
+            if len(self._data) > LARGEST_PART:
+                raise EOFError(f"a part of more than {LARGEST_PART} bytes")
+            self._fill(" within a picture")
+
+    def _fill(self, where: str) -> None:
+        data = self._read()
+        if not data:
+            raise EOFError(f"the stream ended{where}")
+        self._data += data
+
+
+def on_own_clock(unix_s: float) -> float:
+    """A time of exposure in Unix seconds on the monotonic clock; the present time if it is of another clock, or not known (NaN)."""
+    now_s, age_s = time.monotonic(), time.time() - unix_s
+    return now_s - max(age_s, 0.0) if abs(age_s) < CLOCK_SLACK_S else now_s
 
 
 def without_secrets(address: str) -> str:
@@ -167,3 +332,136 @@ def stamped_s(headers: dict[str, str]) -> float:
         return on_own_clock(float(headers[TIME_HEADER]))
     except (KeyError, ValueError):
         return time.monotonic()
+
+
+@dataclass(frozen=True)
+class StreamPart:
+    """A picture as it is sent: its number from 1 on, bytes, further headers, and earliest time of sending (monotonic)."""
+
+    number: int
+    jpeg: bytes
+    headers: dict[str, object] = field(default_factory=dict)
+    due_s: float = 0.0
+
+
+class JpegServer(ThreadingHTTPServer):
+    """Sends the newest picture to every client, each in its own thread.
+
+    Parameters
+    ----------
+    who : str
+        Name of the server, for its threads and errors.
+    host : str
+    port : int
+        Port; 0 for a free one, see ``url``.
+
+    Attributes
+    ----------
+    page : str
+        Page at every address but those of the stream and the line; "" if the stream is at all addresses.
+    line : str
+        The page's line of text.
+    url : str
+        Address of the page, or of the server.
+    """
+
+    page, line = "", ""
+
+    def __init__(self, who: str, host: str, port: int) -> None:
+        with ErrorsAs(OSError, lambda error: cannot_listen(who, host, port, error)):
+            super().__init__((host, port), _Handler)
+        self.url = f"http://{host}:{self.server_port}/"
+        self._new, self.newest, self.ended = threading.Condition(), StreamPart(0, b""), threading.Event()
+        self._thread = threading.Thread(target=self.serve_forever, name=who, daemon=True)
+
+    def start(self) -> None:
+        """Begin to serve."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End."""
+        self.ended.set()
+        if self._thread.is_alive():
+            self.shutdown()
+            self._thread.join()
+        self.server_close()
+
+    def give(self, part: StreamPart) -> None:
+        """Set the newest picture."""
+        with self._new:
+            self.newest = part
+            self._new.notify_all()
+
+    def await_part(self, after: int) -> StreamPart:
+        """The newest picture, as soon as its number is larger than ``after`` and it may be sent, or after a while."""
+        with self._new:
+            self._new.wait_for(lambda: self.newest.number > after, WAIT_S)
+            part = self.newest
+        self.ended.wait(max(0.0, part.due_s - time.monotonic()))
+        return part
+
+    def refuses(self) -> bool:
+        """Whether no client is served at present."""
+        return False
+
+
+class PicturePage(JpegServer):
+    """A context manager; the page is served while it is entered.
+
+    Parameters
+    ----------
+    port : int
+        Port; 0 for a free one, see ``url``.
+    """
+
+    page = PAGE
+
+    def __init__(self, port: int = 0) -> None:
+        super().__init__("preview", "127.0.0.1", port)
+
+    def __enter__(self) -> "PicturePage":
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def show(self, image: np.ndarray, line: str) -> None:
+        """Show a picture (H, W) or (H, W, 3), RGB, with a line of text."""
+        self.line = line
+        self.give(StreamPart(self.newest.number + 1, jpeg_of(image)))
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: JpegServer
+
+    def do_HEAD(self) -> None:
+        if self.server.refuses():
+            self.send_error(503, "unplugged")
+            return
+        self.send_response(200)
+        self.send_header("Content-Type", CONTENT_TYPE if self._streams else "text/html; charset=utf-8")
+        self.end_headers()
+
+    def do_GET(self) -> None:
+        self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, HELD_BYTES)
+        self.do_HEAD()
+        if not self._streams:
+            self.wfile.write((self.server.line if self.path == LINE else self.server.page).encode())
+            return
+        number = 0
+        while not (self.server.ended.is_set() or self.server.refuses()):
+            part = self.server.await_part(number)
+            if part.number > number:
+                try:
+                    write_part(self.wfile, part.jpeg, part.headers)
+                except OSError:
+                    return
+                number = part.number
+
+    @property
+    def _streams(self) -> bool:
+        return not self.server.page or self.path == STREAM
+
+    def log_message(self, *_: object) -> None:
+        """Write no log."""

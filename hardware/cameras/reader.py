@@ -150,18 +150,15 @@ class LiveSource(Connection):
         """Outages, torn and repeated pictures, and irregular files so far, one line each."""
         with self._new:
             outages_s, torn, found = list(self._outages_s), list(self._torn), list(self._notes)
-        if outages_s:
-            spent = f"{sum(outages_s):.1f} s in all, the longest {max(outages_s):.1f} s: no new picture came"
-            found.append(f"{format_count(len(outages_s), 'outages of the camera')}, {spent}")
-        if self.lost:
-            found.append(f"pictures lost before they arrived: {self.lost}; the camera's numbers have gaps")
-        if self.reopened:
-            found.append(f"the camera was opened again {format_count(self.reopened, 'times')}")
-        if torn:
-            found.append(f"pictures left out, incomplete or damaged: {len(torn)}; the last: {torn[-1]}")
-        if self._repeated:
-            found.append(f"{self._repeated} of {self.arrived} pictures repeat the one before them")
-        return found
+        spent = f"{sum(outages_s):.1f} s in all, the longest {max(outages_s, default=0.0):.1f} s: no new picture came"
+        counted = (
+            (len(outages_s), f"{format_count(len(outages_s), 'outages of the camera')}, {spent}"),
+            (self.lost, f"pictures lost before they arrived: {self.lost}; the camera's numbers have gaps"),
+            (self.reopened, f"the camera was opened again {format_count(self.reopened, 'times')}"),
+            (len(torn), f"pictures left out, incomplete or damaged: {len(torn)}; the last: {''.join(torn[-1:])}"),
+            (self._repeated, f"{self._repeated} of {self.arrived} pictures repeat the one before them"),
+        )
+        return [*found, *(text for count, text in counted if count)]
 
     @property
     def same_s(self) -> tuple[float, float] | None:
@@ -246,6 +243,14 @@ class LiveSource(Connection):
         self._repeated = self.lost = self.reopened = 0
 
     def _run(self) -> None:
+        try:
+            self._read_pictures()
+        except Exception as error:
+            with self._new:
+                self._error = error
+                self._new.notify_all()
+
+    def _read_pictures(self) -> None:
         in_a_row = 0
         while not self._end.is_set():
             try:
@@ -258,29 +263,24 @@ class LiveSource(Connection):
                     with self._new:
                         self._torn.append(str(failure))
                 if in_a_row > MOST_FAILED_READS:
-                    self._give_up(
-                        DeviceError(f"{in_a_row} reads in a row failed, the last: {failure}; check camera and cable, then connect again")
-                    )
-                    return
-            except Exception as error:
-                self._give_up(error)
-                return
-            else:
-                in_a_row = 0
-                with self._new:
-                    self.fault = self._look_at(picture)
-                    self._look_back(picture)
-                    self.lost += picture.lost
-                    self.arrived += 1 + picture.lost
-                    self.dropped += 1 + picture.lost
-                    if new := self._is_new(picture):
-                        name = f"frame_{self.arrived:06d}.png"
-                        self._frame = Frame(image, self.form, name, picture.time_s, self.arrived)
-                        if not self.fault:
-                            self._fresh_s = awake_s()
-                    self._new.notify_all()
-                if new and (hear := self.on_frame) is not None and self._frame is not None:
-                    hear(self._frame)
+                    remedy = "check camera and cable, then connect again"
+                    raise DeviceError(f"{in_a_row} reads in a row failed, the last: {failure}; {remedy}") from failure
+                continue
+            in_a_row = 0
+            with self._new:
+                self.fault = self._look_at(picture)
+                self._look_back(picture)
+                self.lost += picture.lost
+                self.arrived += 1 + picture.lost
+                self.dropped += 1 + picture.lost
+                if new := self._is_new(picture):
+                    name = f"frame_{self.arrived:06d}.png"
+                    self._frame = Frame(image, self.form, name, picture.time_s, self.arrived)
+                    if not self.fault:
+                        self._fresh_s = awake_s()
+                self._new.notify_all()
+            if new and (hear := self.on_frame) is not None and self._frame is not None:
+                hear(self._frame)
 
     def _usual_s(self) -> float:
         """Usual time between two pictures."""
@@ -294,11 +294,6 @@ class LiveSource(Connection):
             self._end.wait(FAILED_PAUSE_S)
             raise ReadFailed(str(error)) from error
         self.reopened += 1
-
-    def _give_up(self, error: Exception) -> None:
-        with self._new:
-            self._error = error
-            self._new.notify_all()
 
     def _may_repeat(self, image: np.ndarray) -> bool:
         """Whether pictures like this one may repeat without a fault: those of the twin, and those that their sender thresholded."""
@@ -325,10 +320,8 @@ class LiveSource(Connection):
         if picture.image.max(initial=0) < BLACK_LEVEL:
             return "the picture is black; check the sensor's lamps and the camera's exposure"
         if self.notices_late and (age_s := time.monotonic() - picture.time_s) > LATE_S:
-            return (
-                f"the picture's time stamp is {age_s:.0f} s old; set the clock of the camera's computer to that of this one, "
-                "or look for what delays the pictures"
-            )
+            remedy = "set the clock of the camera's computer to that of this one, or look for what delays the pictures"
+            return f"the picture's time stamp is {age_s:.0f} s old; {remedy}"
         if self._still is None or not np.array_equal(self._still[0], picture.image):
             self._still = (picture.image, picture.time_s, 1)
             return ""

@@ -1,7 +1,7 @@
 """Frames from disk with the protocol of the live sources. They wait for their reader, and have an end."""
 
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from hardware.errors import Connection
@@ -18,6 +18,8 @@ class SequentialSource(Connection):
     ----------
     name : str
     form : Form
+    frames : iterable of Frame
+        All frames from the first one, each time anew.
     """
 
     is_live = False
@@ -27,18 +29,14 @@ class SequentialSource(Connection):
     streams = False  # frames come when they are read
     same_s = None
 
-    def __init__(self, name: str, form: Form) -> None:
-        self.name, self.form = name, form
+    def __init__(self, name: str, form: Form, frames: Iterable[Frame]) -> None:
+        self.name, self.form, self._frames = name, form, frames
         self._left: Iterator[Frame] | None = None
         self._newest: Frame | None = None
 
     @abstractmethod
-    def _frames(self) -> Iterator[Frame]:
-        """All frames from the first one."""
-
     def notes(self) -> list[str]:
         """Irregularities in the frames read so far, one line each."""
-        return []
 
     def blind(self) -> str:
         return ""
@@ -49,7 +47,7 @@ class SequentialSource(Connection):
 
     def connect(self) -> None:
         self._require_disconnected()
-        self._left, self._newest = self._frames(), None
+        self._left, self._newest = iter(self._frames), None
 
     def disconnect(self) -> None:
         self._left = None
@@ -84,13 +82,10 @@ class RecordedSource(SequentialSource):
 
     def __init__(self, path: str | Path, spec: SensorSpec | None = None, form: Form | None = None) -> None:
         self.recording: Recording = open_recording(path, spec, form)
-        super().__init__(str(path), self.recording.form)
+        super().__init__(str(path), self.recording.form, self.recording)
 
     def notes(self) -> list[str]:
         return self.recording.notes()
-
-    def _frames(self) -> Iterator[Frame]:
-        return iter(self.recording)
 
 
 class SessionSource(SequentialSource):
@@ -108,10 +103,7 @@ class SessionSource(SequentialSource):
 
     def __init__(self, folder: str | Path) -> None:
         self.session = Session(folder)
-        super().__init__(str(folder), self.session.form)
+        super().__init__(str(folder), self.session.form, self.session)
 
     def notes(self) -> list[str]:
         return self.session.notes
-
-    def _frames(self) -> Iterator[Frame]:
-        return (self.session.frame(index) for index in range(len(self.session.steps)))

@@ -4,20 +4,18 @@ import time
 
 import numpy as np
 
-from hardware.cameras.coded import decode_picture, on_own_clock
+from hardware.cameras.mjpeg import SILENT_S, decode_picture, on_own_clock
 from hardware.cameras.reader import DevicePicture, LiveSource, ReadFailed, TornPicture
 from hardware.errors import DeviceError
 from hardware.ros2.dds import Participant, Reader, domain_id
 from scenes.files import quote
 from scenes.sensor import SensorSpec
 from twin.errors import ErrorsAs
-from twin.records.ros2_messages import NS_PER_S, decode
+from twin.records.ros2 import NS_PER_S, decode
 from twin.types import Form
 
 PICTURES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage")
 """Messages with a picture."""
-SILENT_S = 2.0
-"""Time, s, without a picture after which a read has failed."""
 CHANNELS = {"mono8": (1, 1), "8UC1": (1, 1), "rgb8": (3, 1), "bgr8": (3, -1), "8UC3": (3, -1), "rgba8": (4, 1), "bgra8": (4, -1)}
 """Encodings of raw pictures: their channels, and 1 for RGB or -1 for BGR."""
 

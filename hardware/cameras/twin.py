@@ -48,7 +48,8 @@ class World(Protocol):
 class _AtPlacedObject:
     """A placed object, which stands still, with finite elements."""
 
-    def __init__(self, spec: SensorSpec, placed: PlacedObject) -> None:
+    def __init__(self, spec: SensorSpec, placed: PlacedObject | None) -> None:
+        assert placed is not None
         self._placed = placed
         self._follower = Follower(SkinSolver(spec), placed.spec, contact_law(spec.rig, placed.mounting, placed.spec))
 
@@ -120,13 +121,9 @@ class TwinCamera(LiveSource):
         self.state: PinState | None = None  # of the newest frame
 
     def _open(self) -> None:
-        if self._preview is None:
-            self._preview = preview_of(self._spec, self.form)
+        self._preview = self._preview or preview_of(self._spec, self.form)
         if self._world is None:
-            world = self._given
-            if world is None:
-                assert self._placed is not None
-                world = _AtPlacedObject(self._spec, self._placed)
+            world = self._given or _AtPlacedObject(self._spec, self._placed)
             world.warm_up()
             self._world = world
 

@@ -106,8 +106,7 @@ class UvcCamera(OpencvCamera):
         self._spec = spec
         self.fps = FPS
         expected = f"expected {', '.join(SETTINGS)} and numbers of 0 or more, as in ?exposure=7.8&gain=4"
-        refuse = ErrorsAs(ValueError, lambda error: DeviceError(f"{self.name}: settings {quote(settings)}: {expected}"))
-        with refuse:
+        with ErrorsAs(ValueError, lambda _: DeviceError(f"{self.name}: settings {quote(settings)}: {expected}")):
             self._settings = {name: float(value) for name, value in parse_qsl(settings, strict_parsing=True)} if settings else {}
             if not self._settings.keys() <= SETTINGS.keys() or not all(0 <= value < np.inf for value in self._settings.values()):
                 raise ValueError

@@ -2,7 +2,7 @@
 
 ``collect_frames`` goes from a plan to labelled frames in a folder, and continues an interrupted collection. The arm starts ``CLEAR_MM``
 from the object and lifts off by ``LIFT_MM`` between two contacts. Between two lifted poses it moves around the object on a path of
-``hardware.rig.approach``; in front of an infinite object it moves straight. A frame counts only if it was exposed after the arm reported
+``hardware.rig.geometry``; in front of an infinite object it moves straight. A frame counts only if it was exposed after the arm reported
 that it stands at the commanded pose. The table holds the reported pose.
 """
 
@@ -34,6 +34,7 @@ from twin.frames.images import write_image
 from twin.pins import Pipeline, measure_reference
 from twin.progress import Progress, Step, silent, stage, unheard
 from twin.records import KeptAlso
+from twin.records.folder import read_json
 from twin.rig.arm_pose import matrix_of, pose_of
 from twin.store import contents, made_by, output, write_json, write_text, writes
 from twin.types import Form, Frame
@@ -91,37 +92,30 @@ class Collection:
         """
         self.pictures = self.folder / pictures_folder(self.form)
         self.folder.mkdir(parents=True, exist_ok=True)
-        meta, about = self.folder / META, json.loads(json.dumps(self.about))
-        if meta.is_file():
-            try:
-                before = json.loads(meta.read_text(encoding="utf-8"))
-                if not isinstance(before, dict):
-                    raise ValueError("expected keys and values")
-            except (ValueError, RecursionError) as error:
-                raise DeviceError(f"{meta}: is damaged ({quote(error)}); remove it if the folder holds no contacts yet") from error
+        meta, table, about = self.folder / META, self.folder / TABLE, json.loads(json.dumps(self.about))
+        other: list[str] = []
+        if known := meta.is_file():
+            before = read_json(meta, error=DeviceError, again="remove it if the folder holds no contacts yet")
             other = [key for key in about if before.get(key) != about[key]]
-            if other and not (self.has_rest or self._has_contacts()):  # a start that failed; nothing is lost
-                write_json(meta, about | {"made_by": made_by(collect, inputs=about)})
-            elif other:
-                raise DeviceError(
-                    f"{self.folder}: holds a collection with other settings ({', '.join(other)}); repeat them or give another `out`"
-                )
+            begun = table.is_file() and table.read_bytes().count(b"\n") > 1  # whatever the lines after the header are
+            if other and (begun or self.rest.is_file()):  # else a start failed, and nothing is lost
+                settings = ", ".join(other)
+                raise DeviceError(f"{self.folder}: holds a collection with other settings ({settings}); repeat them or give another `out`")
         elif contents(self.folder):
             raise DeviceError(f"{self.folder}: holds something else; give an empty or a new folder")
-        else:
+        if other or not known:
             write_json(meta, about | {"made_by": made_by(collect, inputs=about)})
         self.pictures.mkdir(exist_ok=True)
-        table, log = self.folder / TABLE, self.folder / LOG
-        for lines in (table, log):
+        for lines in (table, self.folder / LOG):
             if lines.is_file():
-                self._drop_torn_line(lines)
+                try:
+                    text = lines.read_text(encoding="utf-8")
+                except ValueError as error:
+                    raise DeviceError(f"{lines}: is damaged ({quote(error)}); give another `out`") from error
+                if not text.endswith("\n"):  # the last line is torn
+                    write_text(lines, text[: text.rfind("\n") + 1])
         if not table.is_file() or not table.read_text(encoding="utf-8"):
             write_text(table, ",".join(COLUMNS) + "\n")
-
-    def _has_contacts(self) -> bool:
-        """Whether the table holds more than its header, whatever that is."""
-        table = self.folder / TABLE
-        return table.is_file() and table.read_bytes().count(b"\n") > 1
 
     @property
     def count(self) -> int:
@@ -139,11 +133,6 @@ class Collection:
         if rows[:1] != [list(COLUMNS)] or any(len(row) != len(COLUMNS) for row in rows):
             raise DeviceError(f"{table}: is not the table of a collection; give another `out`")
         return len(rows) - 1
-
-    @property
-    def has_rest(self) -> bool:
-        """Whether the frame without contact has been taken."""
-        return self.rest.is_file()
 
     @property
     def rest(self) -> Path:
@@ -165,13 +154,6 @@ class Collection:
             csv.writer(file, lineterminator="\n").writerow(row)
             file.flush()
             os.fsync(file.fileno())
-
-    @staticmethod
-    def _drop_torn_line(lines: Path) -> None:
-        with ErrorsAs(ValueError, lambda error: DeviceError(f"{lines}: is damaged ({quote(error)}); give another `out`")):
-            text = lines.read_text(encoding="utf-8")
-        if not text.endswith("\n"):
-            write_text(lines, text[: text.rfind("\n") + 1])
 
 
 def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str = "random") -> PlannedContact:
@@ -286,9 +268,9 @@ def collect(
         try:
             with stops.mover.watch.alert():
                 stops.mover.enable()
-                state = stops.go_around(np.zeros(6), CLEAR_MM)
+                state = stops.go(np.zeros(6), CLEAR_MM, around=True)
                 at_object = True
-                if not collection.has_rest:
+                if not collection.rest.is_file():
                     rest = stops.frame_after(state)
                     collection.keep_rest(rest)
                     if on_rest is not None:
@@ -310,7 +292,7 @@ def _collect_one(stops: "_Stops", experiment: ExperimentSpec, collection: Collec
     """
     clear, tap = np.array(experiment.clear), np.array(experiment.tap)
     before = contact.pose - contact.move + clear
-    stops.go_around(before, LIFT_MM)
+    stops.go(before, LIFT_MM, around=True)
     stops.frame_after(stops.go(before))
     stops.frame_after(stops.go(before + tap))
     confirmed = stops.go(contact.pose + clear + tap)
@@ -331,25 +313,17 @@ class _Stops:
     work: WorkFrame
     frame_timeout_s: float
 
-    def go(self, label: np.ndarray, away_mm: float = 0.0) -> ArmState:
-        """Move straight to work coordinates (6,), ``away_mm`` back along the approach. Returns the state there."""
+    def go(self, label: np.ndarray, away_mm: float = 0.0, *, around: bool = False) -> ArmState:
+        """Move to work coordinates (6,), ``away_mm`` back along the approach, straight or around the object. Returns the state there."""
         with self.mover.watch.doing("moving"):
-            return self.mover.go(self._pose(label, away_mm))
-
-    def go_around(self, label: np.ndarray, away_mm: float) -> ArmState:
-        """As ``go``, but on a path around the object."""
-        with self.mover.watch.doing("moving"):
-            return self.mover.go_around(self._pose(label, away_mm))
+            pose = self.work.base_pose(label, self.mover.arm.state().pose, away_mm=away_mm)
+            return self.mover.go_around(pose) if around else self.mover.go(pose)
 
     def frame_after(self, state: ArmState) -> Frame:
         """The first frame exposed after a state."""
-        try:
+        remedy = "check the camera, then repeat the command to continue"
+        with ErrorsAs(TimeoutError, lambda error: DeviceError(f"the arm stands still, but {error}; {remedy}")):
             return self.mover.frame_after(state.time_s, timeout_s=self.frame_timeout_s)
-        except TimeoutError as error:
-            raise DeviceError(f"the arm stands still, but {error}; check the camera, then repeat the command to continue") from error
-
-    def _pose(self, label: np.ndarray, away_mm: float) -> np.ndarray:
-        return self.work.base_pose(label, self.mover.arm.state().pose, away_mm=away_mm)
 
 
 @dataclass(frozen=True)
@@ -457,10 +431,9 @@ def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent)
     before = collection.count
 
     def require_rest(frame: Frame) -> None:
-        try:
+        remedy = f"remove {collection.rest} and repeat the command, which takes it again"
+        with ErrorsAs(FrameError, lambda error: FrameError(f"{error}; {remedy}")):
             measure_reference(plan.sensor, rig.source.form, frame)
-        except FrameError as error:
-            raise FrameError(f"{error}; remove {collection.rest} and repeat the command, which takes it again") from error
 
     def report_contact(done: float, total: float = 1.0, note: str = "") -> None:
         kept.catch_up()  # each contact is kept in the further formats before the next one is made

@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hardware.cameras.picture_page import PicturePage
+from hardware.cameras.mjpeg import PicturePage
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
 from twin.frames.forms import gray_levels
@@ -106,10 +106,9 @@ def record_frames(
                     if len(chosen.kept) > ENOUGH:
                         chosen.notes.append(f"ended at {done} of {count} contacts, after {GIVE_UP_S:.0f} s without a new one ({wish})")
                         break
-                    raise DeviceError(
-                        f"{out}: {done} of {count} contacts after {GIVE_UP_S:.0f} s without a new one; press the sensor at different "
-                        f"places and hold it still, or check the camera ({wish})"
-                    )
+                    remedy = "press the sensor at different places and hold it still, or check the camera"
+                    got = f"{done} of {count} contacts after {GIVE_UP_S:.0f} s without a new one"
+                    raise DeviceError(f"{out}: {got}; {remedy} ({wish})")
                 done = max(len(chosen.kept) - 1, 0)
                 page.show(frame.image, f"{done}/{count}  {wish or 'kept'}")
                 if wish and frame.time_s - chosen.since_s > PATIENCE_S and reminded < done:

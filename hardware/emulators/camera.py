@@ -5,8 +5,7 @@ import time
 
 import numpy as np
 
-from hardware.cameras.coded import jpeg_of
-from hardware.cameras.picture_page import STREAM, WAIT_S, JpegServer, StreamPart
+from hardware.cameras.mjpeg import STREAM, WAIT_S, JpegServer, StreamPart, jpeg_of
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.emulators.faults import EVERY_NTH, SECONDS, Emulator, Fault, Faults
 from hardware.errors import DeviceError
@@ -61,7 +60,6 @@ class CameraEmulator(Emulator):
         self.faults = Faults(FAULTS, faults)
         self._source, self._address = source, (host, port)
         self._running: tuple[_Server, threading.Thread] | None = None
-        self.error: Exception | None = None
         self.made = 0
 
     @property
@@ -83,6 +81,7 @@ class CameraEmulator(Emulator):
         self._running = server, threading.Thread(target=self._make, args=(server,), name="camera emulator", daemon=True)
         server.start()
         self._running[1].start()
+        self.place = f"camera {self.url}"
 
     def stop(self) -> None:
         if self._running is not None:

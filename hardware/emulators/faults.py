@@ -1,14 +1,27 @@
-"""What all emulated devices have: faults, switched on by name (``NAME`` or ``NAME=VALUE``), and a start and an end."""
+"""What all emulated devices have: faults, switched on by name (``NAME`` or ``NAME=VALUE``), a start, an end, a run, and ports."""
 
+import contextlib
+import socket
+import socketserver
+import struct
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from difflib import get_close_matches
-from threading import Timer
-from typing import Self
+from threading import Thread, Timer
+from typing import Any, Self
 
+import numpy as np
+
+from hardware.errors import DeviceError
 from scenes.files import quote
 from twin.errors import ErrorsAs, TwinError
+from twin.signals import signals_as_ctrl_c
+
+SLOWEST, FASTEST = 1e-3, 1e3  # limits of the time scale: beyond them a move takes hours, or no time at all
+CHECK_S = 0.1  # interval, s, at which a failure of the emulator is looked for
+CLOSED_S = 0.05  # interval, s, at which a port checks whether it was closed
 
 
 @dataclass(frozen=True)
@@ -121,7 +134,18 @@ class Faults:
 
 
 class Emulator(ABC):
-    """An emulated device. A context manager, which works between ``start`` and ``stop``."""
+    """An emulated device. A context manager, which works between ``start`` and ``stop``.
+
+    Attributes
+    ----------
+    place : str
+        What listens, and where, from ``start`` on.
+    error : Exception or None
+        The error with which the device ended by itself.
+    """
+
+    place = ""
+    error: Exception | None = None
 
     @abstractmethod
     def start(self) -> None: ...
@@ -129,9 +153,121 @@ class Emulator(ABC):
     @abstractmethod
     def stop(self) -> None: ...
 
+    def run(self) -> None:
+        """Run until SIGTERM or Ctrl-C, or until the device fails, whose error is raised. What listens is printed after ``ready``."""
+        with contextlib.suppress(KeyboardInterrupt), signals_as_ctrl_c(), self:
+            print(f"ready {self.place}", flush=True)  # at once, because a program may wait for it on a pipe
+            while self.error is None:
+                time.sleep(CHECK_S)
+            raise self.error
+
     def __enter__(self) -> Self:
         self.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.stop()
+
+
+class EmulatedArm(Emulator):
+    """An emulated arm.
+
+    Parameters
+    ----------
+    known : dict of str to Fault
+        The faults that it can have.
+    given : tuple of str
+        Those that are switched on.
+    time_scale : float
+        Factor by which it moves faster than the real arm.
+
+    Attributes
+    ----------
+    arm : object
+        Its controller: ``track`` has the motion, and ``update`` brings it up to the present time, which is returned.
+    """
+
+    arm: Any
+
+    def __init__(self, known: dict[str, Fault], given: tuple[str, ...], time_scale: float) -> None:
+        if not SLOWEST <= time_scale <= FASTEST:
+            raise DeviceError(f"`time_scale` {time_scale:g}: expected {SLOWEST:g} to {FASTEST:g} times the real arm's speed")
+        self.faults = Faults(known, given)
+
+    def pose(self, time_s: float | None = None) -> np.ndarray:
+        """Pose (6,) of the tool, or of the flange of an MG400, at a ``time.monotonic()`` (now if not given)."""
+        now_s = self.arm.update()
+        return self.arm.track.pose(now_s if time_s is None else time_s)
+
+
+class PortServer(socketserver.ThreadingTCPServer):
+    """A bound port, which serves clients from the start.
+
+    Parameters
+    ----------
+    address : (str, int)
+    serve : callable
+        Serves a client until it has gone. Then, and if it fails, the client is hung up on.
+    deaf : bool
+        Whether the port takes no clients. It is bound nevertheless, so that nobody else listens there.
+
+    Attributes
+    ----------
+    clients : set of socket
+        The clients that are served.
+
+    Raises
+    ------
+    OSError
+        The port is taken, or the address is not this machine's.
+    """
+
+    allow_reuse_address = daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, address: tuple[str, int], serve: Callable[[socket.socket], None], *, deaf: bool = False) -> None:
+        super().__init__(address, socketserver.BaseRequestHandler, bind_and_activate=False)
+        self.clients: set[socket.socket] = set()
+        self._serve, self._deaf = serve, deaf
+        try:
+            self.server_bind()
+        except OSError:
+            self.server_close()
+            raise
+        if not deaf:
+            self.server_activate()
+            Thread(target=self.serve_forever, args=(CLOSED_S,), daemon=True, name="emulated port").start()
+
+    def process_request(self, request: socket.socket, client_address: object) -> None:  # type: ignore[override]
+        """Begin to serve a client."""
+        self.clients.add(request)
+        super().process_request(request, client_address)
+
+    def finish_request(self, request: socket.socket, client_address: object) -> None:  # type: ignore[override]
+        """Serve a client, in its thread."""
+        with contextlib.suppress(OSError, ValueError, struct.error):
+            request.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._serve(request)
+
+    def shutdown_request(self, request: socket.socket) -> None:  # type: ignore[override]
+        """Hang up on a client."""
+        self.clients.discard(request)
+        super().shutdown_request(request)
+
+    def lose(self, *, abruptly: bool = False) -> None:
+        """Lose every connection and take no more; ``abruptly``: they are reset, as after a power loss."""
+        if not self._deaf:
+            self.shutdown()
+        self.server_close()
+        for client in self.clients.copy():
+            with contextlib.suppress(OSError):
+                if abruptly:
+                    client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                    client.close()
+                else:
+                    client.shutdown(socket.SHUT_RDWR)
+
+
+def fault_lines(known: dict[str, Fault]) -> list[str]:
+    """Lines of text about an emulator's faults: default values and effects."""
+    return [f"{name + ('' if fault.allowed is None else f'={fault.default:g}'):22} {fault.effect}" for name, fault in known.items()]

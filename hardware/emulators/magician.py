@@ -6,15 +6,12 @@ import os
 import random
 import select
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from threading import Event, Lock, Thread
 
-import numpy as np
-
 from hardware.arms.magician_wire import Message, take_message
-from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Fault, Faults, Range
-from hardware.emulators.magician_controller import START_JOINTS_DEG, EmulatedController
+from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, EmulatedArm, Fault, Range
+from hardware.emulators.magician_controller import EmulatedController
 from twin.errors import ErrorsAs, TwinError
 
 LOG = logging.getLogger(__name__)
@@ -35,7 +32,7 @@ FAULTS = {
 }
 
 
-class MagicianEmulator(Emulator):
+class MagicianEmulator(EmulatedArm):
     """A Magician on a pseudo-terminal. A context manager, which works between ``start`` and ``stop``.
 
     Parameters
@@ -44,7 +41,6 @@ class MagicianEmulator(Emulator):
         Symbolic link to the terminal. It is removed at the end. A link that leads nowhere is replaced.
     faults : iterable of str
         ``NAME`` or ``NAME=VALUE`` of ``FAULTS``; ``faults`` can be changed while it runs.
-    joints_deg : (4,) float
     time_scale : float
         Factor by which it moves faster than the real arm.
 
@@ -54,26 +50,15 @@ class MagicianEmulator(Emulator):
         The terminal that a client opens.
     """
 
-    def __init__(
-        self,
-        *,
-        link: Path | None = None,
-        faults: tuple[str, ...] = (),
-        joints_deg: Sequence[float] = START_JOINTS_DEG,
-        time_scale: float = 1.0,
-    ) -> None:
-        self.faults = Faults(FAULTS, faults)
-        self.arm = EmulatedController(self.faults, joints_deg=joints_deg, time_scale=time_scale)
+    def __init__(self, *, link: Path | None = None, faults: tuple[str, ...] = (), time_scale: float = 1.0) -> None:
+        super().__init__(FAULTS, faults, time_scale)
+        self.arm = EmulatedController(self.faults, time_scale=time_scale)
         self.device = ""
         self._link = link
         self._ends: tuple[int, int] | None = None  # file descriptors: our end, the client's end
         self._lock, self._ended = Lock(), Event()
         self._thread: Thread | None = None
         self._noise, self._replies = random.Random(0), 0
-
-    def pose(self, time_s: float | None = None) -> np.ndarray:
-        """Pose (6,) of the tool at a ``time.monotonic()`` (now if not given)."""
-        return self.arm.pose(time_s)
 
     def start(self) -> None:
         """Make the terminal.
@@ -99,6 +84,7 @@ class MagicianEmulator(Emulator):
                 raise TwinError(f"{self._link}: can't make the link ({error.strerror}); remove it or give another `link`") from error
         self._thread = Thread(target=self._serve, daemon=True, name="magician-emulator")
         self._thread.start()
+        self.place = f"magician {self._link or self.device}"
         self.faults.after("unplugged", self.unplug)
 
     def stop(self) -> None:

@@ -4,9 +4,9 @@ import logging
 import math
 import struct
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from threading import RLock
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +25,7 @@ START_JOINTS_DEG = (0.0, 45.0, 45.0, 0.0)
 HOME_SPEED_DEG_S = 30.0
 # Length of a jog, mm and deg. It is longer than every range of motion.
 JOG_MM, JOG_DEG = 400.0, 300.0
-# Parameters that are stored as received: their numbers' form, and their initial values. The number of bytes must agree.
+# Parameters that are stored as received: their form, and their initial values.
 STORED: dict[int, tuple[str, tuple[float, ...]]] = {
     Id.HOME_PARAMS: ("<4f", (200.0, 0.0, 0.0, 0.0)),
     Id.END_EFFECTOR: ("<3f", (0.0,) * 3),
@@ -40,46 +40,31 @@ STORED: dict[int, tuple[str, tuple[float, ...]]] = {
     Id.ARC_PARAMS: ("<4f", (100.0,) * 4),
     Id.HANDHELD_OUTPUT: ("<B", (0,)),
 }
-PARAMETERS: dict[int, bytes] = {id: struct.pack(form, *values) for id, (form, values) in STORED.items()}
-# Parts that are not attached to the arm: bytes of a write, and the reply to a read, which shows no signal.
-NOT_ATTACHED: dict[int, tuple[int, bytes]] = {
-    Id.MOTOR: (6, b""),
-    Id.MOTOR_STEPS: (10, b""),
-    Id.COLOR: (3, bytes(3)),
-    Id.INFRARED: (2, bytes(1)),
+# Forms of the parameters of commands that can't be read. pydobot sends CP without its last number.
+ACTS: dict[int, tuple[str, ...]] = {
+    Id.RESET_POSE: ("<x2f",),
+    Id.HOME: ("<4x", ""),
+    Id.JOG: ("<2B",),
+    Id.PTP: ("<B4f",),
+    Id.CP: ("<B3f4x", "<B3fx"),
+    Id.CP_LASER: ("<B4f",),
+    Id.ARC: ("<8f",),
+    Id.WAIT: ("<I",),
 }
-# Commands that report what the device is, with their replies to a read. The values are chosen for the emulator.
+# Forms of the parameters of all commands whose number of bytes is known, also of those for parts that are not attached to the arm.
+NOT_ATTACHED: dict[int, tuple[str, ...]] = {Id.MOTOR: ("<6x",), Id.MOTOR_STEPS: ("<10x",), Id.COLOR: ("<3x",), Id.INFRARED: ("<2x",)}
+FORMS: dict[int, tuple[str, ...]] = {**ACTS, **NOT_ATTACHED, **{id: (form,) for id, (form, _) in STORED.items()}}
+# Commands that report what the device is. Their replies are chosen for the emulator.
 DEVICE_SERIAL, DEVICE_NAME, DEVICE_VERSION, POSE_L = 0, 1, 2, 13
-TOLD: dict[int, bytes] = {
+# Replies to a read. Parts that are not attached show no signal.
+REPLIES: dict[int, bytes] = {
     DEVICE_SERIAL: b"EMULATED",
     DEVICE_NAME: b"Dobot Magician",
     DEVICE_VERSION: bytes([3, 7, 0]),  # major, minor, revision
     POSE_L: struct.pack("<f", 0.0),  # place of the arm on a slide, mm; there is none
-}
-# Numbers of bytes that a command's parameters may have. pydobot sends CP without its last number: 14 bytes.
-SIZES: dict[int, tuple[int, ...]] = {
-    Id.RESET_POSE: (9,),
-    Id.HOME: (4, 0),
-    Id.JOG: (2,),
-    Id.PTP: (17,),
-    Id.CP: (17, 14),
-    Id.CP_LASER: (17,),
-    Id.ARC: (32,),
-    Id.WAIT: (4,),
-}
-# The same for all commands with a known number of bytes. Those of ``SIZES`` can't be read.
-WRITTEN = SIZES | {id: (len(stored),) for id, stored in PARAMETERS.items()} | {id: (bytes_n,) for id, (bytes_n, _) in NOT_ATTACHED.items()}
-# Floating-point numbers at the beginning of a command's parameters. All must be finite.
-NUMBERS: dict[int, struct.Struct] = {
-    id: struct.Struct(form.rstrip("B"))
-    for id, form in {
-        **{id: form for id, (form, _) in STORED.items() if "f" in form},
-        Id.RESET_POSE: "<x2f",
-        Id.PTP: "<x4f",
-        Id.CP: "<x3f",
-        Id.CP_LASER: "<x4f",
-        Id.ARC: "<8f",
-    }.items()
+    Id.COLOR: bytes(3),
+    Id.INFRARED: bytes(1),
+    **{id: struct.pack(form, *values) for id, (form, values) in STORED.items()},
 }
 # Parameters that are speeds and accelerations, which must be above 0, because a move at 0 or less has no time.
 SPEEDS = {Id.PTP_JOINT_PARAMS, Id.PTP_COORDINATE_PARAMS, Id.PTP_COMMON_PARAMS, Id.CP_PARAMS, Id.ARC_PARAMS}
@@ -87,50 +72,55 @@ SPEEDS = {Id.PTP_JOINT_PARAMS, Id.PTP_COORDINATE_PARAMS, Id.PTP_COMMON_PARAMS, I
 JOG_SPEEDS = {Id.JOG_JOINT_PARAMS, Id.JOG_COORDINATE_PARAMS, Id.JOG_COMMON_PARAMS}
 
 
-@dataclass(frozen=True)
-class Queued:
-    """A queued command and the time of its arrival."""
+def numbers_in(message: Message) -> tuple[Any, ...] | None:
+    """The numbers in a command's parameters. None: there is no such command, or it has other parameters, or they are not allowed.
 
-    index: int
-    message: Message
-    time_s: float
+    Floating-point numbers must be finite, and speeds and accelerations above 0.
+    """
+    if message.id not in FORMS:
+        return () if message.id in set(Id) else None
+    form = next((form for form in FORMS[message.id] if struct.calcsize(form) == len(message.params)), None)
+    if form is None:
+        return None
+    numbers = struct.unpack(form, message.params)
+    floats = [number for number in numbers if isinstance(number, float)]
+    slow = (message.id in SPEEDS and min(floats) <= 0) or (message.id in JOG_SPEEDS and min(floats) < 0)
+    return None if slow or not all(map(math.isfinite, floats)) else numbers
 
 
 class EmulatedController:
     """Executes the commands of the arm. Every method may be called from any thread."""
 
-    def __init__(self, faults: Faults, *, joints_deg: Sequence[float] = START_JOINTS_DEG, time_scale: float = 1.0) -> None:
+    def __init__(self, faults: Faults, *, time_scale: float = 1.0) -> None:
         self.faults, self._time_scale = faults, time_scale
         self.kinematics = MAGICIAN
-        self.track = MotionTrack(MAGICIAN, np.asarray(joints_deg, float))
+        self.track = MotionTrack(MAGICIAN, np.array(START_JOINTS_DEG))
         self.lock = RLock()
         self.alarms: set[int] = set()
-        self._params = dict(PARAMETERS)
-        self._queue: list[Queued] = []
+        self._replies = dict(REPLIES)
+        self._queue: list[tuple[int, Message, float]] = []  # numbers of the commands, and the times of their arrival
         self._running = False
         self._since_s = self._ends_s = -np.inf  # when the first command may begin, and when it ends (inf: not begun)
         self._begun, self._lost_at_s = False, np.inf
         self._issued = self._current = 0
 
-    def pose(self, time_s: float | None = None) -> np.ndarray:
-        with self.lock:
-            now_s = self.advance()
-            return self.track.pose(now_s if time_s is None else time_s)
-
     def answer(self, message: Message) -> Message:
         """Execute a command or queue it. The reply has the same id and ctrl."""
         with self.lock:
-            now_s = self.advance()
-            if not self._understands(message):
+            now_s, reply = self.update(), b""
+            writes = message.is_write or message.is_queued  # with the write bit or, from some clients, without
+            if numbers_in(message) is None if writes else message.id in ACTS:  # clients read anything, to find out what there is
                 return self.refuse(message)
-            if message.is_queued:  # with the write bit or, from some clients, without
-                if len(self._queue) >= QUEUE_N:
-                    return Message(message.id, message.ctrl)  # no index, because the command was not accepted
+            if not writes:
+                reply = self._answer_read(message, now_s)
+            elif not message.is_queued:
+                self._write(message, now_s)
+            elif len(self._queue) < QUEUE_N:  # otherwise the reply has no index, because the command was not accepted
                 self._issued += 1
-                self._queue.append(Queued(self._issued, message, now_s))
-                self.advance()
-                return Message(message.id, message.ctrl, struct.pack("<Q", self._issued))
-            return Message(message.id, message.ctrl, self._write(message, now_s) if message.is_write else self._answer_read(message, now_s))
+                self._queue.append((self._issued, message, now_s))
+                self.update()
+                reply = struct.pack("<Q", self._issued)
+            return replace(message, params=reply)
 
     def refuse(self, message: Message) -> Message:
         """Raise the alarm of a command that is not understood. The reply is empty."""
@@ -141,9 +131,9 @@ class EmulatedController:
     def busy(self) -> bool:
         """Whether commands are in progress or queued."""
         with self.lock:
-            return bool(self._queue) or self.track.moving(self.advance())
+            return bool(self._queue) or self.track.moving(self.update())
 
-    def advance(self) -> float:
+    def update(self) -> float:
         """Execute the queue up to the present time, which is returned. A command that fails ends with an alarm and is not tried again."""
         now_s = time.monotonic()
         with self.lock:
@@ -151,41 +141,20 @@ class EmulatedController:
                 self.alarms.add(LOST_STEPS)
                 self._lost_at_s = np.inf
             while self._running and self._queue and not self.alarms:
-                head = self._queue[0]
+                index, message, came_s = self._queue[0]
                 if not self._begun:
-                    begins_s = max(self._since_s, head.time_s)
+                    begins_s = max(self._since_s, came_s)
                     try:
-                        self._ends_s = self._do(head.message, begins_s)
+                        self._ends_s = self._do(message, begins_s)
                     except Exception:
-                        LOG.exception("emulated Magician: queued command %d failed and was dropped", head.message.id)
+                        LOG.exception("emulated Magician: queued command %d failed and was dropped", message.id)
                         self._ends_s = self._alarm(NOT_UNDERSTOOD, begins_s)
                     self._begun = True
                 if self._ends_s > now_s:
                     break
-                self._since_s, self._current, self._begun = self._ends_s, head.index, False
+                self._since_s, self._current, self._begun = self._ends_s, index, False
                 self._queue.pop(0)
             return now_s
-
-    def _understands(self, message: Message) -> bool:
-        """Whether a command is known and its parameters are allowed. A read of anything unknown is allowed: clients ask what there is."""
-        writes = message.is_write or message.is_queued
-        return self._has_its_form(message, writes=writes) and (not writes or self._has_allowed_numbers(message))
-
-    @staticmethod
-    def _has_its_form(message: Message, *, writes: bool) -> bool:
-        if not writes:
-            return message.id not in SIZES
-        return len(message.params) in WRITTEN[message.id] if message.id in WRITTEN else message.id in set(Id)
-
-    @staticmethod
-    def _has_allowed_numbers(message: Message) -> bool:
-        """Whether all numbers are finite, and speeds and accelerations are above 0."""
-        if message.id not in NUMBERS:
-            return True
-        numbers = NUMBERS[message.id].unpack_from(message.params)
-        if not all(map(math.isfinite, numbers)):
-            return False
-        return min(numbers) > 0 if message.id in SPEEDS else min(numbers) >= 0 or message.id not in JOG_SPEEDS
 
     def _answer_read(self, message: Message, now_s: float) -> bytes:
         if message.id == Id.GET_POSE:
@@ -197,13 +166,9 @@ class EmulatedController:
             return struct.pack("<Q", self._current)
         if message.id == Id.QUEUE_SPACE:
             return struct.pack("<Q" if "wide-queue-space" in self.faults else "<I", max(0, QUEUE_N - len(self._queue)))
-        if message.id in NOT_ATTACHED:
-            return NOT_ATTACHED[message.id][1]
-        if message.id in TOLD:
-            return TOLD[message.id]
-        return self._params.get(message.id, b"")
+        return self._replies.get(message.id, b"")
 
-    def _write(self, message: Message, now_s: float) -> bytes:
+    def _write(self, message: Message, now_s: float) -> None:
         if message.id == Id.ALARMS:
             self.alarms.clear()
         elif message.id == Id.QUEUE_START:
@@ -218,24 +183,21 @@ class EmulatedController:
             self._begun = False
         else:
             self._do(message, now_s)
-        return b""
 
     def _do(self, message: Message, begins_s: float) -> float:
         """Begin a command; returns the time at which it ends."""
-        params = message.params
-        if message.id in PARAMETERS:
-            self._params[message.id] = params
+        numbers = numbers_in(message) or ()
+        if message.id in STORED:
+            self._replies[message.id] = message.params
             if message.id == Id.END_EFFECTOR:
-                self._set_tool(struct.unpack("<3f", params)[0], begins_s)
+                self._set_tool(numbers[0], begins_s)
         elif message.id == Id.PTP:
-            mode, *numbers = struct.unpack("<B4f", params)
-            return self._ptp(mode, np.array(numbers), begins_s)
+            return self._ptp(numbers[0], np.array(numbers[1:]), begins_s)
         elif message.id == Id.ARC:
-            return self._arc(np.array(struct.unpack("<8f", params)), begins_s)
+            return self._arc(np.array(numbers), begins_s)
         elif message.id in (Id.CP, Id.CP_LASER):
-            absolute, x, y, z = struct.unpack("<B3f", params[:13])
             here = self.track.pose(np.inf)
-            end = np.array([x, y, z, 0, 0, 0]) if absolute else here + [x, y, z, 0, 0, 0]
+            end = np.array([*numbers[1:4], 0, 0, 0]) + (0.0 if numbers[0] else here)
             end[5] = here[5]
             acceleration, speed, *_ = self._parameters_of(Id.CP_PARAMS)
             return self._go(end, Speeds(speed, speed, acceleration, acceleration), begins_s, linear=True)
@@ -243,10 +205,9 @@ class EmulatedController:
             x, y, z, r = self._parameters_of(Id.HOME_PARAMS)
             return self._go_to(np.array([x, y, z, 0, 0, r]), Speeds(HOME_SPEED_DEG_S, HOME_SPEED_DEG_S), begins_s)
         elif message.id == Id.WAIT:
-            return begins_s + struct.unpack("<I", params)[0] / 1000.0
+            return begins_s + numbers[0] / 1000.0
         elif message.id == Id.JOG:
-            joints, command = params
-            self._jog(joints, command, begins_s)
+            self._jog(numbers[0], numbers[1], begins_s)
         return begins_s  # ResetPose needs no action: the emulated arm always knows its pose
 
     def _ptp(self, mode: int, numbers: np.ndarray, begins_s: float) -> float:
@@ -336,7 +297,7 @@ class EmulatedController:
         return line, Speeds(speed * joints[0], speed * min(joints[:4]), acceleration * joints[4], acceleration * min(joints[4:]))
 
     def _parameters_of(self, id: Id) -> tuple:
-        return struct.unpack(STORED[id][0], self._params[id])
+        return struct.unpack(STORED[id][0], self._replies[id])
 
     def _set_tool(self, x_mm: float, time_s: float) -> None:
         if x_mm == self.kinematics.r0_mm:  # so that the past poses stay known

@@ -11,28 +11,15 @@ from threading import Event
 
 import numpy as np
 
-from hardware.arms.mg400_wire import (
-    DASHBOARD_PORT,
-    FEEDBACK_PERIOD_S,
-    MOTION_PORT,
-    PACKET,
-    PACKET_BYTES,
-    ROBOT_TYPE_MG400,
-    TEST_VALUE,
-    ErrorId,
-    Mode,
-    require_ports,
-)
-from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Fault, Faults, Range
-from hardware.emulators.mg400_commands import Mg400Commands, parse_firmware
-from hardware.emulators.mg400_controller import START_JOINTS_DEG, Mg400Controller, PlanarFrame
-from hardware.emulators.mg400_grammar import RefusedError, Request, refuse_if, take_request
-from hardware.emulators.servers import PortServer
+from hardware.arms import mg400_wire as wire
+from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, EmulatedArm, Fault, PortServer, Range
+from hardware.emulators.mg400_commands import Mg400Commands, Request, parse_firmware, take_request
+from hardware.emulators.mg400_controller import START_JOINTS_DEG, Mg400Controller, PlanarFrame, RefusedError, refuse_if
 from hardware.errors import cannot_listen
 from twin.errors import ErrorsAs, TwinError
 
 LOG = logging.getLogger(__name__)
-PORTS = (DASHBOARD_PORT, MOTION_PORT, *FEEDBACK_PERIOD_S)
+PORTS = (wire.DASHBOARD_PORT, wire.MOTION_PORT, *wire.FEEDBACK_PERIOD_S)
 OLD_FIRMWARE, NEW_FIRMWARE = "1.5.5", "1.7.0"
 # First firmware whose replies have numbers; older firmware answers bare echoes.
 FIRST_NUMBERED_REPLIES = (1, 5, 6)
@@ -70,7 +57,7 @@ FAULTS = {
 }
 
 
-class Mg400Emulator(Emulator):
+class Mg400Emulator(EmulatedArm):
     """An MG400 on loopback. A context manager, which listens between ``start`` and ``stop``.
 
     Parameters
@@ -110,9 +97,9 @@ class Mg400Emulator(Emulator):
     ) -> None:
         with ErrorsAs(ValueError, lambda error: TwinError(str(error))):
             version = parse_firmware(OLD_FIRMWARE if lenient else firmware)
-        require_ports(port_offset or 0)
+        wire.require_ports(port_offset or 0)
+        super().__init__(FAULTS, faults, time_scale)
         self.host, self._port_offset = host, port_offset
-        self.faults = Faults(FAULTS, faults)
         self.arm = Mg400Controller(self.faults, joints_deg=joints_deg, time_scale=time_scale)
         self._commands = Mg400Commands(self.arm, version)
         self._bare, self._lenient = version < FIRST_NUMBERED_REPLIES, lenient
@@ -120,11 +107,6 @@ class Mg400Emulator(Emulator):
         self._servers: dict[int, PortServer] = {}  # by the arm's own ports
         self._ended = Event()
         self._started_s = time.monotonic()
-
-    def pose(self, time_s: float | None = None) -> np.ndarray:
-        """Pose (6,) of the flange at a ``time.monotonic()`` (now if not given)."""
-        now_s = self.arm.update()
-        return self.arm.track.pose(now_s if time_s is None else time_s)
 
     def start(self) -> None:
         """Begin to listen.
@@ -134,8 +116,8 @@ class Mg400Emulator(Emulator):
         DeviceError
             A port is taken, or the host is not this machine's.
         """
-        deaf = {MOTION_PORT} if "motion-port-closed" in self.faults else set()
-        deaf |= set(FEEDBACK_PERIOD_S) if "no-feedback" in self.faults else {30004} if "no-fast-feedback" in self.faults else set()
+        deaf = {wire.MOTION_PORT} if "motion-port-closed" in self.faults else set()
+        deaf |= set(wire.FEEDBACK_PERIOD_S) if "no-feedback" in self.faults else {30004} if "no-fast-feedback" in self.faults else set()
         for port in PORTS:
             at = self.host, 0 if self._port_offset is None else port + self._port_offset
             try:
@@ -144,28 +126,26 @@ class Mg400Emulator(Emulator):
                 self.stop()
                 raise cannot_listen("mg400", *at, error, option="`port_offset`") from error
             self.ports[port] = server.server_address[1]
+        self.place = " ".join(map(str, ("mg400", self.host, *self.ports.values())))
         self._started_s = time.monotonic()
         self.faults.after("emergency-stop", self.arm.press_emergency_stop)
         self.faults.after("die", self.kill)
 
-    def stop(self) -> None:
-        """Close all connections and stop listening."""
-        self._close(abruptly=False)
-
-    def kill(self) -> None:
-        """Emulate a power loss: every connection is reset and no port listens."""
-        self._close(abruptly=True)
-
-    def _close(self, *, abruptly: bool) -> None:
+    def stop(self, *, abruptly: bool = False) -> None:
+        """Close all connections and stop listening; ``abruptly``: every connection is reset."""
         self._ended.set()
         for server in self._servers.values():
             server.lose(abruptly=abruptly)
 
+    def kill(self) -> None:
+        """Emulate a power loss: every connection is reset and no port listens."""
+        self.stop(abruptly=True)
+
     def _serve(self, port: int, client: socket.socket) -> None:
         if "one-client" in self.faults and len(self._servers[port].clients) > 1:
             return
-        if port in FEEDBACK_PERIOD_S:
-            self._feed(client, FEEDBACK_PERIOD_S[port])
+        if port in wire.FEEDBACK_PERIOD_S:
+            self._feed(client, wire.FEEDBACK_PERIOD_S[port])
         else:
             self._converse(client, port)
 
@@ -201,35 +181,34 @@ class Mg400Emulator(Emulator):
                 request, buffer = take_request(buffer)
 
     def _answer(self, client: socket.socket, port: int, request: Request) -> None:
+        error_id, values, waits = 0, "", request.name in ("sync", "syncall")
         try:
             values = self._execute(port, request)
-        except Exception as error:
-            refusal = error if isinstance(error, RefusedError) else RefusedError(ErrorId.FAILED)
-            if refusal is not error:
-                LOG.exception("emulated MG400: %s failed and was refused", request.text)
-            if "split-refusals" in self.faults and not self._bare:
-                client.sendall(f"{refusal.error_id},{{}},;".encode())
-                time.sleep(0.02)  # the client receives two pieces
-                reply = f"{request.text};"
-            else:
-                reply = f"{refusal.error_id},{{}},{request.text};"
-        else:  # a connection that is lost while it waits is no command that failed
-            if request.name in ("sync", "syncall") and not self._wait_until_done(client):
-                return
-            reply = f"0,{{{values}}},{request.text};"
-        if port == MOTION_PORT and "no-move-reply" in self.faults and request.name not in ("sync", "syncall"):
+        except RefusedError as refusal:
+            error_id = refusal.error_id
+        except Exception:
+            error_id = wire.ErrorId.FAILED
+            LOG.exception("emulated MG400: %s failed and was refused", request.text)
+        if waits and not error_id and not self._wait_until_done(client):  # a connection that is lost meanwhile is no command that failed
+            return
+        reply = f"{error_id},{{{values}}},{request.text};"
+        if error_id and "split-refusals" in self.faults and not self._bare:
+            client.sendall(f"{error_id},{{}},;".encode())
+            time.sleep(0.02)  # the client receives two pieces
+            reply = f"{request.text};"
+        if port == wire.MOTION_PORT and "no-move-reply" in self.faults and not waits:
             return
         if not self._bare:
             client.sendall(reply.encode())
-        elif port == DASHBOARD_PORT or self._lenient:
+        elif port == wire.DASHBOARD_PORT or self._lenient:
             client.sendall(f"{request.text};".encode())
 
     def _execute(self, port: int, request: Request) -> str:
         refuse_if("no-tcp-mode" in self.faults)
-        alone = not self._servers[MOTION_PORT].clients
-        refuse_if(alone and ("needs-motion-client" in self.faults or "motion-port-closed" in self.faults), ErrorId.NO_SUCH_COMMAND)
-        commands = self._commands.dashboard if port == DASHBOARD_PORT else self._commands.motion
-        refuse_if(request.name not in commands, ErrorId.NO_SUCH_COMMAND)
+        alone = not self._servers[wire.MOTION_PORT].clients
+        refuse_if(alone and ("needs-motion-client" in self.faults or "motion-port-closed" in self.faults), wire.ErrorId.NO_SUCH_COMMAND)
+        commands = self._commands.dashboard if port == wire.DASHBOARD_PORT else self._commands.motion
+        refuse_if(request.name not in commands, wire.ErrorId.NO_SUCH_COMMAND)
         with self.arm.lock:
             return commands[request.name](request) or ""
 
@@ -252,15 +231,15 @@ class Mg400Emulator(Emulator):
 def feedback_packet(arm: Mg400Controller) -> np.ndarray:
     """The present state as a record of ``PACKET``. The arm follows its targets exactly. Currents and forces are not emulated."""
     mode, now_s = arm.mode(), arm.update()
-    user, tool = arm.users[arm.user], arm.tools[arm.tool]
+    user, tool = (arm.frames[kind][index] for kind, index in arm.selected.items())
     joints, before = arm.track.joints_deg(now_s), arm.track.joints_deg(now_s - DIFFERENCE_S)
-    seen = _tool_in_user_frame(arm, joints, user, tool)
-    speed = (seen - _tool_in_user_frame(arm, before, user, tool)) / DIFFERENCE_S
+    seen, seen_before = (np.array(user.inverse() @ PlanarFrame.of_pose(arm.kinematics.forward(at)) @ tool) for at in (joints, before))
+    speed = (seen - seen_before) / DIFFERENCE_S
     half_turn = np.radians(seen[3]) / 2
-    packet = np.zeros((), PACKET)
+    packet = np.zeros((), wire.PACKET)
     fields: dict[str, object] = {
-        "length": PACKET_BYTES,
-        "test_value": TEST_VALUE,
+        "length": wire.PACKET_BYTES,
+        "test_value": wire.TEST_VALUE,
         "digital_out": arm.digital_out,
         "mode": int(mode),
         "unix_ms": int(time.time() * 1000),
@@ -269,27 +248,21 @@ def feedback_packet(arm: Mg400Controller) -> np.ndarray:
         **dict.fromkeys(("qd_target", "qd_actual"), [*((joints - before) / DIFFERENCE_S), 0, 0]),
         **dict.fromkeys(("tool_target", "tool_actual"), [*seen, 0, 0]),
         **dict.fromkeys(("tcp_speed_target", "tcp_speed_actual"), [*speed, 0, 0]),
-        "user_index": arm.user,
-        "tool_index": arm.tool,
+        "user_index": arm.selected["user"],
+        "tool_index": arm.selected["tool"],
         "queue_runs": arm.queue_runs,
         "paused": arm.paused,
         "enabled": arm.enabled,
-        "drag": mode == Mode.BACKDRIVE,
-        "running": mode == Mode.RUNNING,
+        "drag": mode == wire.Mode.BACKDRIVE,
+        "running": mode == wire.Mode.RUNNING,
         "error": bool(arm.alarms),
-        "jog": mode == Mode.JOG,
-        "robot_type": ROBOT_TYPE_MG400,
+        "jog": mode == wire.Mode.JOG,
+        "robot_type": wire.ROBOT_TYPE_MG400,
         "load": arm.load,
-        "user": [user.x, user.y, user.z, user.r, 0, 0],
-        "tool": [tool.x, tool.y, tool.z, tool.r, 0, 0],
+        "user": [*user, 0, 0],
+        "tool": [*tool, 0, 0],
         **dict.fromkeys(("target_quaternion", "actual_quaternion"), [np.cos(half_turn), 0, 0, np.sin(half_turn)]),
     }
     for name, value in fields.items():
         packet[name] = value
     return packet
-
-
-def _tool_in_user_frame(arm: Mg400Controller, joints: np.ndarray, user: PlanarFrame, tool: PlanarFrame) -> np.ndarray:
-    """X, Y, Z, R of the tool in the user frame."""
-    flange = PlanarFrame.of_pose(arm.kinematics.forward(joints))
-    return (user.inverse() @ flange @ tool).pose[[0, 1, 2, 5]]

@@ -1,17 +1,37 @@
-"""The commands of the emulated MG400 for each of its ports, with their parameters and replies."""
+"""The emulated MG400's requests, ``Name(p1,p2,Key=v)``, which are found in a stream, and its commands with their parameters and replies."""
 
+import math
 import re
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import astuple, replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from hardware.arms.mg400_wire import ErrorId
 from hardware.arms.motion import Speeds, circle
-from hardware.emulators.mg400_controller import Mg400Controller, Order, PlanarFrame
-from hardware.emulators.mg400_grammar import NUMBER, Parameter, RefusedError, Request, keyword_number, read_numbers, read_table, refuse_if
+from hardware.emulators.mg400_controller import Mg400Controller, Order, PlanarFrame, RefusedError, refuse_if
+from twin.errors import ErrorsAs
 
+# Most characters of a request that is not complete. No command of the arm is nearly as long.
+LONGEST_REQUEST = 4096
+# Largest coordinate, mm, and angle, deg. A larger one counts as this one: no arm gets there either, and sums and products stay finite.
+FARTHEST = 1e5
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """Type and range of a command's parameter. A number whose size is above ``most`` counts as that size."""
+
+    integer: bool = False
+    low: float = float("-inf")
+    high: float = float("inf")
+    most: float = float("inf")
+
+
+# A coordinate or an angle of any size.
+NUMBER = Parameter(most=FARTHEST)
 # A speed or an acceleration, percent.
 PERCENT = Parameter(integer=True, low=1, high=100)
 # Ratio of continuous-path blending, percent.
@@ -34,10 +54,10 @@ LAPS = Parameter(integer=True, low=1, high=999)
 CENTRE_MM = Parameter(low=-500.0, high=500.0)
 # Time that the queue waits, ms.
 WAIT_MS = Parameter(integer=True, low=1, high=3_600_000)
-# Parameters of commands that have no effect here.
-CHECKED = {"arch": INDEX, "limz": NUMBER, "loadswitch": BIT, "di": INPUT, "tooldi": TOOL_PORT} | {
-    name: Parameter(integer=True, low=low, high=high) for name, low, high in (("setcollisionlevel", 0, 5), ("setarmorientation", -1, 1))
-}
+# A collision level, and a part of an arm's orientation.
+LEVEL, SIDE = Parameter(integer=True, low=0, high=5), Parameter(integer=True, low=-1, high=1)
+# A place with R, and the numbers of a user and a tool frame.
+PLACE, PLACE_IN_FRAMES = (NUMBER,) * 4, (NUMBER,) * 4 + (INDEX,) * 2
 # Number of a joint.
 JOINT = Parameter(integer=True, low=1, high=4)
 # Numbers of Modbus slaves, of their registers, and of the values in one request. Slave 0 is the controller itself.
@@ -49,8 +69,122 @@ AXES = {f"{axis}{sign}" for axis in ("j1", "j2", "j3", "j4", "x", "y", "z", "r")
 # Number of servos. GetErrorID replies with the controller's alarms, followed by those of each servo.
 SERVOS_N = 4
 
+
+@dataclass(frozen=True)
+class Request:
+    """One request: name in lower case, parameters, keywords in lower case, and the received text.
+
+    A malformed request has no name, so it is no command.
+    """
+
+    name: str
+    values: tuple[str, ...]
+    keywords: dict
+    text: str
+
+    def whole(self, n: int, parameter: Parameter) -> int:
+        """The whole number at a position of the values, from 0; raises as ``read_numbers``."""
+        return int(_number(self.values[n], parameter, n + 1))
+
+
+def take_request(buffer: str) -> tuple[Request | None, str]:
+    """The first request in the received text (None if there is none), and the rest of the text.
+
+    A request ends at its closing ``)``. It needs no newline. A request that is not closed ends at a newline, or when it is longer than
+    ``LONGEST_REQUEST``. It is malformed, so that it is refused and what follows it is understood.
+    """
+    depth = begin = 0
+    for n, letter in enumerate(buffer):
+        depth += {"(": 1, ")": -1}.get(letter, 0)
+        if letter == ")" and depth <= 0:
+            return _parse(_bare(buffer[begin : n + 1])), buffer[n + 1 :]
+        if letter == "\n":
+            if text := _bare(buffer[begin:n]):
+                return _malformed_request(text), buffer[n + 1 :]
+            begin = n + 1
+    rest = buffer[begin:]
+    return (_malformed_request(_bare(rest)), "") if len(rest) > LONGEST_REQUEST else (None, rest)
+
+
+def _bare(text: str) -> str:
+    """The text without what may separate requests."""
+    return text.strip(" \r\n\t;")
+
+
+def _malformed_request(text: str) -> Request:
+    return Request("", (), {}, text)
+
+
+def _parse(text: str) -> Request:
+    name, _, inside = text.partition("(")
+    values, keywords = [], {}
+    for part in re.split(r",(?![^{(]*[})])", inside[:-1]):  # not at commas within braces or parentheses
+        key, equals, value = part.partition("=")
+        if equals:
+            keywords[key.strip().lower()] = value.strip()
+        elif part.strip():  # some clients send a comma at the end
+            values.append(part.strip())
+    return Request(name.strip().lower(), tuple(values), keywords, text)
+
+
+def read_numbers(request: Request, parameters: tuple[Parameter, ...], counts: tuple[int, ...]) -> list[float]:
+    """The request's values as numbers.
+
+    Raises
+    ------
+    RefusedError
+        The number of values is wrong (-20000), or the type (-3000n) or the range (-4000n) of the n-th value.
+    """
+    refuse_if(len(request.values) not in counts, ErrorId.PARAMETER_COUNT)
+    return [_number(text, parameter, n) for n, (text, parameter) in enumerate(zip(request.values, parameters, strict=False), start=1)]
+
+
+def read_table(text: str, counts: tuple[int, ...], n: int, most: float = FARTHEST) -> list[float]:
+    """Numbers of the n-th parameter, ``{x,y,z,r}`` or ``(x,y,z,r)``. A number whose size is above ``most`` counts as that size.
+
+    Raises
+    ------
+    RefusedError
+        The values are not numbers (-3000n), or are not finite or have the wrong count (-4000n).
+    """
+    with ErrorsAs(ValueError, lambda error: RefusedError(ErrorId.PARAMETER_TYPE - n)):
+        numbers = [float(part) for part in text.strip("{}() '\"").split(",")]
+    refuse_if(len(numbers) not in counts or not all(map(math.isfinite, numbers)), ErrorId.PARAMETER_RANGE - n)
+    return [max(-most, min(number, most)) for number in numbers]
+
+
+def keyword_number(request: Request, key: str, parameter: Parameter, default: float) -> float:
+    """The value of a keyword, or the default. In error ids, keywords are numbered after the values."""
+    if key not in request.keywords:
+        return default
+    return _number(request.keywords[key], parameter, len(request.values) + 1 + list(request.keywords).index(key))
+
+
+def _number(text: str, parameter: Parameter, n: int) -> float:
+    with ErrorsAs(ValueError, lambda error: RefusedError(ErrorId.PARAMETER_TYPE - n)):
+        number = int(text) if parameter.integer else float(text)
+    refuse_if(
+        not (parameter.low <= number <= parameter.high and math.isfinite(number)), ErrorId.PARAMETER_RANGE - n
+    )  # a whole number may be too large for isfinite
+    return max(-parameter.most, min(number, parameter.most))
+
+
 Command = Callable[[Request], str | None]
 """A command, which returns the values of its reply; None if it has none."""
+
+
+def command_of(act: Callable[..., str | None], *parameters: Parameter, counts: tuple[int, ...] = ()) -> Command:
+    """A command that is a function of the numbers in its request, of which there are as many as parameters, or one of ``counts``."""
+    return lambda request: act(*read_numbers(request, parameters, counts or (len(parameters),)))
+
+
+def _nothing(*_: float) -> None:
+    """Have no effect."""
+
+
+def _no_signal(*_: float) -> str:
+    """An input to which nothing is attached."""
+    return "0"
 
 
 class Mg400Commands:
@@ -67,37 +201,43 @@ class Mg400Commands:
         self._slaves: dict[int, dict[tuple[str, int], float]] = {0: {}}  # what each Modbus slave holds, by table and address
         arm = controller
         self.dashboard: dict[str, Command] = {
-            "enablerobot": self._enable,
-            "disablerobot": self._plain(arm.disable),
-            "clearerror": self._plain(arm.clear_error),
-            "resetrobot": self._plain(arm.reset),
-            "pause": self._plain(arm.pause),
-            "continue": self._plain(arm.resume),
-            "emergencystop": self._plain(arm.press_emergency_stop),
-            "robotmode": self._plain(lambda: str(int(arm.mode()))),
-            "getangle": self._plain(lambda: _text(self._joints())),
+            "enablerobot": command_of(self._enable, LOAD_KG, CENTRE_MM, CENTRE_MM, CENTRE_MM, counts=(0, 1, 4)),
+            "disablerobot": command_of(arm.disable),
+            "clearerror": command_of(arm.clear_error),
+            "resetrobot": command_of(arm.reset),
+            "pause": command_of(arm.pause),
+            "continue": command_of(arm.resume),
+            "emergencystop": command_of(arm.press_emergency_stop),
+            "robotmode": command_of(lambda: str(int(arm.mode()))),
+            "getangle": command_of(lambda: _text(arm.track.joints_deg(arm.update()))),
             "getpose": self._get_pose,
-            "geterrorid": self._plain(self._error_ids),
-            "user": self._select,
-            "tool": self._select,
-            "positivesolution": self._forward,
+            "geterrorid": command_of(self._error_ids),
+            **{kind: command_of(partial(self._select, kind), INDEX) for kind in ("user", "tool")},
+            "positivesolution": command_of(self._forward, *PLACE_IN_FRAMES),
             "inversesolution": self._inverse,
             **dict.fromkeys(("do", "doexecute", "dogroup"), self._output),
-            **dict.fromkeys(("tooldo", "tooldoexecute"), self._tool_output),
-            **dict.fromkeys(("setpayload", "payload"), self._payload),
-            **dict.fromkeys(CHECKED, self._only_check),
-            "startdrag": self._plain(lambda: arm.drag(True)),
-            "stopdrag": self._plain(lambda: arm.drag(False)),
-            **dict.fromkeys(arm.percent, self._percentage),
-            "brakecontrol": self._brake,
+            **dict.fromkeys(("tooldo", "tooldoexecute"), command_of(_nothing, TOOL_PORT, BIT)),
+            **dict.fromkeys(("setpayload", "payload"), command_of(self._payload, LOAD_KG, NUMBER, counts=(1, 2))),
+            "di": command_of(_no_signal, INPUT),
+            "tooldi": command_of(_no_signal, TOOL_PORT),
+            "arch": command_of(_nothing, INDEX),
+            "limz": command_of(_nothing, NUMBER),
+            "loadswitch": command_of(_nothing, BIT),
+            "setcollisionlevel": command_of(_nothing, LEVEL),
+            "setarmorientation": command_of(_nothing, SIDE, SIDE, SIDE, SIDE, counts=(1, 4)),
+            "startdrag": command_of(lambda: arm.drag(True)),
+            "stopdrag": command_of(lambda: arm.drag(False)),
+            **{name: command_of(partial(arm.set_percent, name), RATIO if name == "cp" else PERCENT) for name in arm.percent},
+            # Those of an enabled arm are not switched. An emulated arm does not sink, so a brake has no effect.
+            "brakecontrol": command_of(lambda joint, on: refuse_if(arm.enabled), JOINT, BIT),
             "runscript": self._run_script,
-            **dict.fromkeys(("stopscript", "pausescript", "continuescript"), self._plain(lambda: None)),  # no project runs
+            **dict.fromkeys(("stopscript", "pausescript", "continuescript"), command_of(_nothing)),  # no project runs
             "modbuscreate": self._create_slave,
-            "modbusclose": self._close_slave,
+            "modbusclose": command_of(self._close_slave, SLAVE),
             **dict.fromkeys(("getcoils", "getinbits", "getinregs", "getholdregs", "setcoils", "setholdregs"), self._registers),
         }
         if firmware >= (1, 5, 9):
-            self.dashboard["wait"] = self._wait
+            self.dashboard["wait"] = command_of(self._wait, WAIT_MS, counts=(0, 1))
         if firmware >= (1, 6):
             self.dashboard |= {"setuser": self._define, "settool": self._define, "calcuser": self._calculate, "calctool": self._calculate}
         self.motion: dict[str, Command] = {
@@ -107,39 +247,12 @@ class Mg400Commands:
             **dict.fromkeys(("jointmovj", "reljointmovj"), self._to_joints),
             "movejog": self._jog,
             **{f"relmov{kind}{frame}": self._relative for kind in "jl" for frame in ("user", "tool", "")},
-            "sync": self._plain(lambda: None),  # the server sends the reply when the queue is empty
-            "syncall": self._plain(lambda: None),
+            **dict.fromkeys(("sync", "syncall"), command_of(_nothing)),  # the server sends the reply when the queue is empty
         }
 
-    def _plain(self, action: Callable[[], str | None]) -> Command:
-        def run(request: Request) -> str | None:
-            read_numbers(request, (), (0,))
-            return action()
-
-        return run
-
-    def _enable(self, request: Request) -> None:
-        load = read_numbers(request, (LOAD_KG, CENTRE_MM, CENTRE_MM, CENTRE_MM), (0, 1, 4))
+    def _enable(self, kg: float = 0.0, x_mm: float = 0.0, y_mm: float = 0.0, z_mm: float = 0.0) -> None:
         self.arm.enable()
-        kg, x_mm, y_mm, z_mm = load + [0.0] * (4 - len(load))
         self.arm.load = kg, x_mm, y_mm, z_mm
-
-    def _percentage(self, request: Request) -> None:
-        (percent,) = read_numbers(request, (RATIO if request.name == "cp" else PERCENT,), (1,))
-        if request.name == "speedfactor":
-            self.arm.set_speed_factor(percent)
-        else:
-            self.arm.percent[request.name] = percent
-
-    def _only_check(self, request: Request) -> str:
-        counts = (1, 4) if request.name == "setarmorientation" else (1,)
-        read_numbers(request, (CHECKED[request.name],) * counts[-1], counts)
-        return "0" if request.name in ("di", "tooldi") else ""  # nothing is attached, so no input has a signal
-
-    def _brake(self, request: Request) -> None:
-        """The brakes of an enabled arm are not switched. An emulated arm does not sink, so a brake has no effect."""
-        read_numbers(request, (JOINT, BIT), (2,))
-        refuse_if(self.arm.enabled)
 
     def _run_script(self, request: Request) -> None:
         """There is no project on this controller."""
@@ -153,9 +266,8 @@ class Mg400Commands:
         self._slaves[free[0]] = {}
         return str(free[0])
 
-    def _close_slave(self, request: Request) -> None:
-        (index,) = read_numbers(request, (SLAVE,), (1,))
-        refuse_if(self._slaves.pop(int(index), None) is None)
+    def _close_slave(self, index: int) -> None:
+        refuse_if(self._slaves.pop(index, None) is None)
 
     def _registers(self, request: Request) -> str:
         """``GetHoldRegs(index,address,count[,type])``, ``SetHoldRegs(index,address,count,{values}[,type])``, and those of other tables."""
@@ -170,41 +282,32 @@ class Mg400Commands:
             return ""
         return ",".join(f"{self._slaves[index].get(place, 0.0):.15g}" for place in places)
 
-    def _select(self, request: Request) -> None:
-        (index,) = read_numbers(request, (INDEX,), (1,))
-        self._frame(self._frames_named(request), index)
-        setattr(self.arm, request.name, int(index))
+    def _select(self, kind: str, index: int) -> None:
+        self._frame(kind, index)
+        self.arm.selected[kind] = index
 
-    def _frames_named(self, request: Request) -> dict[int, PlanarFrame]:
-        """The user or the tool frames, whichever a command is about."""
-        return self.arm.users if request.name.endswith("user") else self.arm.tools
-
-    def _frame_of(self, request: Request, first: int) -> PlanarFrame:
+    def _frame_in(self, request: Request, first: int) -> PlanarFrame:
         """The frame ``{x,y,z,r}`` that begins at a parameter; its braces may be missing."""
-        text, n = ",".join(request.values[first:]), first + 1
-        values = read_table(text, (4, 6), n)
-        x, y, z = values[:3]
-        return PlanarFrame(x, y, z, values[3] if len(values) == 4 else values[5])
+        x, y, z, *turns = read_table(",".join(request.values[first:]), (4, 6), first + 1)
+        return PlanarFrame(x, y, z, turns[-1])
 
     def _define(self, request: Request) -> None:
         refuse_if(len(request.values) not in (2, 5, 7), ErrorId.PARAMETER_COUNT)
-        frame = self._frame_of(request, 1)
-        self._frames_named(request)[request.whole(0, INDEX)] = frame
+        frame = self._frame_in(request, 1)
+        self.arm.frames[request.name.removeprefix("set")][request.whole(0, INDEX)] = frame
 
     def _calculate(self, request: Request) -> str:
         """A frame after an offset along the base's axes (1) or along its own (0)."""
         refuse_if(len(request.values) not in (3, 6, 8), ErrorId.PARAMETER_COUNT)
-        frame, offset = self._frame(self._frames_named(request), request.whole(0, INDEX)), self._frame_of(request, 2)
+        frame, offset = self._frame(request.name.removeprefix("calc"), request.whole(0, INDEX)), self._frame_in(request, 2)
         along_base = request.whole(1, BIT)
-        return _text(np.add(astuple(frame), astuple(offset)) if along_base else astuple(frame @ offset))
+        return _text(np.add(frame, offset) if along_base else frame @ offset)
 
-    def _payload(self, request: Request) -> None:
-        kg = read_numbers(request, (LOAD_KG, NUMBER), (1, 2))[0]
+    def _payload(self, kg: float, inertia: float = 0.0) -> None:
         self.arm.load = kg, *self.arm.load[1:]
 
-    def _wait(self, request: Request) -> None:
-        times_ms = read_numbers(request, (WAIT_MS,), (0, 1))
-        self.arm.order(Order(np.zeros(6), True, self.arm.speeds(100.0, 100.0), wait_s=(times_ms[0] if times_ms else 0.0) / 1000.0))
+    def _wait(self, time_ms: float = 0.0) -> None:
+        self.arm.order(Order(np.zeros(6), True, self.arm.speeds(100.0, 100.0), wait_s=time_ms / 1000.0))
 
     def _output(self, request: Request) -> None:
         """``DO(index,level)``, which waits in the queue, ``DOExecute(index,level)`` and ``DOGroup(index,level,index,level,...)``."""
@@ -217,56 +320,42 @@ class Mg400Commands:
         for index, level in zip(values[::2], values[1::2], strict=True):
             self.arm.set_output(index, level)
 
-    def _tool_output(self, request: Request) -> None:
-        index, level = (int(value) for value in read_numbers(request, (TOOL_PORT, BIT), (2,)))
-        bit = 1 << (index - 1)
-        self.arm.tool_out = self.arm.tool_out | bit if level else self.arm.tool_out & ~bit
-
     def _error_ids(self) -> str:
         self.arm.update()
         groups = int(self.arm.faults.value("error-groups") or 1 + SERVOS_N)
         return "[" + ",".join([str(self.arm.alarms).replace(" ", ""), *["[]"] * (groups - 1)]) + "]"
 
-    def _joints(self) -> np.ndarray:
-        return self.arm.track.joints_deg(self.arm.update())
-
     def _get_pose(self, request: Request) -> str:
         read_numbers(request, (), (0,))
         refuse_if(request.keywords and self.firmware >= (1, 7), ErrorId.PARAMETER_TYPE - 1)
-        pose = self._tool_in_user_frame(PlanarFrame.of_pose(self.arm.track.pose(self.arm.update())), *self._frames(request))
+        user, tool = self._frames(request)
+        pose = user.inverse() @ PlanarFrame.of_pose(self.arm.track.pose(self.arm.update())) @ tool
         return _text([*pose, 0.0, 0.0] if "six-value-pose" in self.arm.faults else pose)
 
-    def _forward(self, request: Request) -> str:
-        *joints, user, tool = read_numbers(request, (NUMBER,) * 4 + (INDEX,) * 2, (6,))
+    def _forward(self, *joints_and_frames: float) -> str:
+        *joints, user, tool = joints_and_frames
         refuse_if(self.arm.kinematics.violation(np.array(joints)))
         flange = PlanarFrame.of_pose(self.arm.kinematics.forward(np.array(joints)))
-        return _text(self._tool_in_user_frame(flange, self._frame(self.arm.users, user), self._frame(self.arm.tools, tool)))
+        return _text(self._frame("user", user).inverse() @ flange @ self._frame("tool", tool))
 
     def _inverse(self, request: Request) -> str:
         refuse_if(
             len(request.values) not in (6, 7, 8), ErrorId.PARAMETER_COUNT
         )  # two optional parameters select the solution near given joints; here there is only one
-        *pose, user, tool = read_numbers(Request(request.name, request.values[:6], {}, request.text), (NUMBER,) * 4 + (INDEX,) * 2, (6,))
-        joints = self.arm.joints_at(self._flange(pose, self._frame(self.arm.users, user), self._frame(self.arm.tools, tool)))
+        *pose, user, tool = read_numbers(replace(request, values=request.values[:6]), PLACE_IN_FRAMES, (6,))
+        joints = self.arm.joints_at(self._frame("user", user) @ PlanarFrame(*pose) @ self._frame("tool", tool).inverse())
         refuse_if(self.arm.kinematics.violation(joints))
         return _text(joints)
 
     def _to_pose(self, request: Request) -> None:
-        place, groups = self._split_outputs(request)
-        pose = read_numbers(place, (NUMBER,) * 4, (4,))
-        flange = self._flange(pose, *self._frames(request))
+        """Move to a place. Moves with IO have outputs ``{Mode,Distance,Index,Status}``, which they set on their path."""
+        groups = [value for value in request.values if value[0] in "{(" and request.name.endswith("io")]
+        refuse_if(request.name.endswith("io") and not groups, ErrorId.PARAMETER_COUNT)
+        place = read_numbers(replace(request, values=request.values[: len(request.values) - len(groups)]), PLACE, (4,))
+        flange = self._flange(place, request)
         length_mm = float(np.linalg.norm(flange.pose[:3] - self.arm.last_target().pose[:3]))
         outputs = tuple(self._on_the_way(text, n, length_mm) for n, text in enumerate(groups, start=5))
         self._order(flange, request, linear=request.name.startswith("movl"), outputs=outputs)
-
-    @staticmethod
-    def _split_outputs(request: Request) -> tuple[Request, tuple[str, ...]]:
-        """A move and the outputs ``{Mode,Distance,Index,Status}`` that it sets on its path. Only moves with IO have outputs."""
-        if not request.name.endswith("io"):
-            return request, ()
-        groups = tuple(value for value in request.values if value[0] in "{(")
-        refuse_if(not groups, ErrorId.PARAMETER_COUNT)
-        return replace(request, values=request.values[: len(request.values) - len(groups)]), groups
 
     @staticmethod
     def _on_the_way(text: str, n: int, length_mm: float) -> tuple[float, int, int]:
@@ -295,7 +384,7 @@ class Mg400Commands:
 
     def _go_round(self, request: Request, numbers: list[float], *, laps: int) -> None:
         """Queue the lines of an arc, or of whole circles. Places on one straight line are refused."""
-        via, end = (self._flange(part, *self._frames(request)).pose for part in (numbers[:4], numbers[4:]))
+        via, end = (self._flange(part, request).pose for part in (numbers[:4], numbers[4:]))
         start = self.arm.last_target().pose
         poses = circle(start, via, end, whole=laps > 0)
         refuse_if(len(poses) == 2)
@@ -305,15 +394,13 @@ class Mg400Commands:
 
     def _relative(self, request: Request) -> None:
         """``RelMovLUser(dx, dy, dz, dr, user)`` and similar commands. The offset is along the axes of the user or tool frame."""
-        values = read_numbers(request, (NUMBER,) * 4 + (INDEX,), (4, 5))
-        offset, index = PlanarFrame(*values[:4]), int(values[4]) if len(values) == 5 else None
-        last = self.arm.last_target()
-        if request.name.endswith("tool"):
-            tool = self._frame(self.arm.tools, self.arm.tool if index is None else index)
-            end = last @ tool @ offset @ tool.inverse()
+        values, kind = read_numbers(request, (*PLACE, INDEX), (4, 5)), "tool" if request.name.endswith("tool") else "user"
+        frame = self._frame(kind, values[4] if len(values) == 5 else self.arm.selected[kind])
+        last, offset = self.arm.last_target(), PlanarFrame(*values[:4])
+        if kind == "tool":
+            end = last @ frame @ offset @ frame.inverse()
         else:
-            turn = PlanarFrame(r=self._frame(self.arm.users, self.arm.user if index is None else index).r)
-            along = turn @ offset
+            along = PlanarFrame(r=frame.r) @ offset
             end = PlanarFrame(last.x + along.x, last.y + along.y, last.z + along.z, last.r + offset.r)
         self._order(end, request, linear=request.name[6] == "l")
 
@@ -325,7 +412,7 @@ class Mg400Commands:
         self.arm.order(order)
 
     def _to_joints(self, request: Request) -> None:
-        joints = np.array(read_numbers(request, (NUMBER,) * 4, (4,)))
+        joints = np.array(read_numbers(request, PLACE, (4,)))
         if request.name == "reljointmovj":
             joints = joints + self.arm.joints_at(self.arm.last_target())
         self.arm.order(Order(joints, False, self._speeds(request, "j")))
@@ -344,23 +431,18 @@ class Mg400Commands:
         keyword_number(request, "cp", RATIO, self.arm.percent["cp"])  # only the value is checked: the emulator does not blend moves
         return self.arm.speeds(speed, acceleration)
 
-    def _frames(self, request: Request) -> tuple[PlanarFrame, PlanarFrame]:
-        user = keyword_number(request, "user", INDEX, self.arm.user)
-        tool = keyword_number(request, "tool", INDEX, self.arm.tool)
-        return self._frame(self.arm.users, user), self._frame(self.arm.tools, tool)
+    def _frames(self, request: Request) -> list[PlanarFrame]:
+        """The user and the tool frame of a request."""
+        return [self._frame(kind, keyword_number(request, kind, INDEX, self.arm.selected[kind])) for kind in ("user", "tool")]
 
-    @staticmethod
-    def _frame(frames: dict, index: float) -> PlanarFrame:
-        refuse_if(int(index) not in frames)
-        return frames[int(index)]
+    def _frame(self, kind: str, index: float) -> PlanarFrame:
+        refuse_if(index not in self.arm.frames[kind])
+        return self.arm.frames[kind][int(index)]
 
-    @staticmethod
-    def _flange(pose: list[float], user: PlanarFrame, tool: PlanarFrame) -> PlanarFrame:
-        return user @ PlanarFrame(*pose) @ tool.inverse()
-
-    @staticmethod
-    def _tool_in_user_frame(flange: PlanarFrame, user: PlanarFrame, tool: PlanarFrame) -> list[float]:
-        return list((user.inverse() @ flange @ tool).pose[[0, 1, 2, 5]])
+    def _flange(self, place: list[float], request: Request) -> PlanarFrame:
+        """The flange where the tool of a request is at a place in its user frame."""
+        user, tool = self._frames(request)
+        return user @ PlanarFrame(*place) @ tool.inverse()
 
 
 def _text(values: Iterable[float]) -> str:

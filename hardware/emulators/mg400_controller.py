@@ -4,6 +4,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from threading import RLock
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,7 +12,6 @@ from hardware.arms.kinematics import MG400, OutOfReachError, Violation
 from hardware.arms.mg400_wire import MAX_JOINT_DEG_S, MAX_LINEAR_MM_S, ErrorId, Mode
 from hardware.arms.motion import MotionTrack, Piece, Speeds, check_line
 from hardware.emulators.faults import Faults
-from hardware.emulators.mg400_grammar import RefusedError, refuse_if
 from twin.errors import ErrorsAs
 
 # Largest accelerations. They are chosen for the emulator, because those of a real arm are not known.
@@ -26,8 +26,21 @@ JOG_STEP = 1.0
 JOG_REACH = 1000.0
 
 
-@dataclass(frozen=True)
-class PlanarFrame:
+class RefusedError(Exception):
+    """A request is refused with an error id."""
+
+    def __init__(self, error_id: int) -> None:
+        super().__init__(f"refused: {error_id}")
+        self.error_id = int(error_id)
+
+
+def refuse_if(wrong: object, error_id: int = ErrorId.FAILED) -> None:
+    """Raise ``RefusedError`` if something is wrong."""
+    if wrong:
+        raise RefusedError(error_id)
+
+
+class PlanarFrame(NamedTuple):
     """A user or tool frame of an arm that turns about z only."""
 
     x: float = 0.0
@@ -90,12 +103,12 @@ class Mg400Controller:
         self.enabled = self.paused = False
         self.alarms: list[int] = []
         self.load = (0.0, 0.0, 0.0, 0.0)
-        self.digital_out = self.tool_out = 0
+        self.digital_out = 0
         self.dragged = False
         self._outputs: list[tuple[float, int, int]] = []  # time, index and level of outputs that moves will set
         self.percent = {"speedj": 100.0, "speedl": 100.0, "accj": 100.0, "accl": 100.0, "cp": 0.0, "speedfactor": 100.0}
-        self.users, self.tools = {0: PlanarFrame()}, {0: PlanarFrame()}
-        self.user, self.tool = 0, 0
+        self.frames = {kind: {0: PlanarFrame()} for kind in ("user", "tool")}
+        self.selected = {"user": 0, "tool": 0}  # numbers of the frames
         self._orders: list[Order] = []  # started, or planned on the track
         self._held: list[Order] = []  # waiting for Continue
         self._due: list[tuple[float, tuple[int, ...]]] = []  # future alarms
@@ -185,12 +198,14 @@ class Mg400Controller:
             self.reset()
             self.dragged = begin
 
-    def set_speed_factor(self, percent: float) -> None:
-        """``SpeedFactor``: it also applies to moves in progress and queued moves."""
+    def set_percent(self, name: str, percent: float) -> None:
+        """Set a percentage. ``SpeedFactor`` also applies to moves in progress and queued moves."""
         with self.lock:
-            now_s = self.update()
-            share = percent / self.percent["speedfactor"]
-            self.percent["speedfactor"] = percent
+            now_s, before = self.update(), self.percent[name]
+            self.percent[name] = percent
+            if name != "speedfactor":
+                return
+            share = percent / before
             waiting = [one for one in self._orders if one.end_s > now_s]
             self._held = [one.at(share) for one in self._held]
             if not waiting:
@@ -284,14 +299,12 @@ class Mg400Controller:
                 step[int(axis[1]) - 1] = sign
             length, violation = 0.0, None
             while violation is None and length < JOG_REACH:
-                violation = self._at_end(start + (length + JOG_STEP) * step, linear)
+                beyond = start + (length + JOG_STEP) * step
+                violation = check_line(self.kinematics, beyond, beyond) if linear else self.kinematics.violation(beyond)
                 length += JOG_STEP if violation is None else 0.0
             self._plan(Order(start + length * step, linear, self.speeds(10.0, 100.0), jog=True))
             if violation is not None:
                 self._due = [(self.track.end_s, (violation.code,))]
-
-    def _at_end(self, end: np.ndarray, linear: bool) -> Violation | None:
-        return check_line(self.kinematics, end, end) if linear else self.kinematics.violation(end)
 
     def _plan(self, order: Order) -> None:
         if order.wait_s is not None:

@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 from hardware.arms.motion import between
 from hardware.arms.ros2 import COMMANDS, JOINTS, POSE, STAGE, measure_way, topic_in
 from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, Emulator, Fault, Faults, Range
-from hardware.emulators.running import run_until_signal
 from hardware.errors import DeviceError
 from hardware.ros2.dds import Participant, Reader, Writer, domain_id
-from twin.records import ros2_messages as ros
+from twin.records import ros2 as ros
 from twin.rig.arm_pose import matrix_of, pose_of
 
 PERIOD_S = 0.01
@@ -82,6 +81,7 @@ class Ros2Emulator(Emulator):
         given = participant.reader(command, self._kind), participant.writer(pose, POSE), participant.writer(joints, JOINTS)
         self._thread = Thread(target=self._run, args=given, daemon=True, name="ros2-emulator")
         self._thread.start()
+        self.place = f"ros2 {' '.join(self.topics)} in domain {domain_id()}"
         self.faults.after("die", self._ended.set)
 
     def stop(self) -> None:
@@ -130,9 +130,3 @@ class Ros2Emulator(Emulator):
             _, writer, message = self._late.popleft()
             if "silent-feedback" not in self.faults:
                 writer.write(message, time.time_ns())
-
-
-def emulate_ros2(*, form: str = "twist", namespace: str = "", faults: tuple[str, ...] = ()) -> None:
-    """Emulate an arm behind ROS 2 until it is ended; see ``Ros2Emulator``."""
-    arm = Ros2Emulator(form, namespace=namespace, faults=faults)
-    run_until_signal(arm, lambda: f"ros2 {' '.join(arm.topics)} in domain {domain_id()}")

@@ -7,12 +7,11 @@ from hardware.arms.arm import ArmState
 from hardware.arms.mg400_link import Feedback
 from hardware.arms.mg400_wire import FEEDBACK_PERIOD_S, address_of, pose_in
 from hardware.emulators.camera import CameraEmulator
-from hardware.emulators.running import run_until_signal
 from hardware.rig.geometry import PlacedObject
 from hardware.workcell.build import twin_camera
 from scenes import ObjectSpec, SensorSpec, ServoSpec, load_experiment
 from twin.errors import OptionError
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.types import Form
 
 # Largest age, s, of feedback that is used.
@@ -83,11 +82,11 @@ def emulate_camera(
     faults : tuple of str
         See ``CameraEmulator``.
     plain_light : bool
-        Without path tracing at the start; see ``hardware.workcell.build.drawn``.
+        Without path tracing at the start; see ``hardware.workcell.build.draw_window``.
     """
     placed = PlacedObject(obj, servo.placement, Mounting.of(sensor, load_experiment(servo.experiment)))
     pose = FeedbackPose.of(arm)
     source = twin_camera(sensor, placed, pose, Form.RAW, fps=fps, plain_light=plain_light)
     device = CameraEmulator(source, host=host, port=port, faults=faults)
     with pose:
-        run_until_signal(device, lambda: f"camera {device.url}", lambda: device.error)
+        device.run()

@@ -24,9 +24,7 @@ from hardware.arms.kinematics import Violation
 from hardware.arms.motion import MotionTrack, Speeds
 from hardware.arms.ur.driver import DASHBOARD_PORT, EMERGENCY, IDLE, NORMAL, PAUSED, PLAYING, POWER_OFF, PROTECTIVE, RUNNING, STOPPED
 from hardware.arms.ur.kinematics import UrKinematics, pose_from_ur, pose_to_ur
-from hardware.emulators.faults import SECONDS, SHARE, Emulator, Fault, Faults
-from hardware.emulators.running import require_time_scale, run_until_signal
-from hardware.emulators.servers import PortServer
+from hardware.emulators.faults import SECONDS, SHARE, EmulatedArm, Fault, Faults, PortServer
 from hardware.errors import cannot_listen
 
 LOG = logging.getLogger(__name__)
@@ -102,6 +100,10 @@ class UrController:
     def busy(self) -> bool:
         """Whether the arm moves."""
         return self.track.moving(time.monotonic())
+
+    def update(self) -> float:
+        """The present time, up to which its cycles go on by themselves."""
+        return time.monotonic()
 
     def cycle(self) -> dict[str, Any]:
         """Go on to the present time; returns the values of RTDE's variables, of which those that are missing are 0."""
@@ -226,7 +228,7 @@ def type_of(name: str) -> str:
     return next((kind for kind, names in NAMES.items() if re.fullmatch(names, name)), "NOT_FOUND")
 
 
-class UrEmulator(Emulator):
+class UrEmulator(EmulatedArm):
     """A UR5 on loopback. A context manager, which listens between ``start`` and ``stop``.
 
     Parameters
@@ -240,8 +242,7 @@ class UrEmulator(Emulator):
     """
 
     def __init__(self, *, host: str | None = "127.0.0.1", faults: tuple[str, ...] = (), time_scale: float = 1.0) -> None:
-        require_time_scale(time_scale)
-        self.faults = Faults(FAULTS, faults)
+        super().__init__(FAULTS, faults, time_scale)
         self.arm = UrController(self.faults, time_scale)
         self.host = host or f"127.{random.randrange(1, 255)}.{random.randrange(256)}.{random.randrange(1, 255)}"
         self._ports: list[PortServer] = []
@@ -249,13 +250,10 @@ class UrEmulator(Emulator):
         self._owner: socket.socket | None = None  # the client whose inputs the registers take
         self._ended = Event()
 
-    def pose(self, time_s: float | None = None) -> np.ndarray:
-        """Pose (6,) of the tool at a ``time.monotonic()`` (now if not given)."""
-        return self.arm.track.pose(time.monotonic() if time_s is None else time_s)
-
     def start(self) -> None:
         """Begin to listen; errors as for ``plug``."""
         self.plug()
+        self.place = f"ur {self.host}"
         Thread(target=self._run, daemon=True, name="ur-emulator").start()
         self.faults.after("unplugged", self.unplug)
         self.faults.after("emergency-stop", self.arm.press_emergency_stop)
@@ -357,8 +355,3 @@ class UrEmulator(Emulator):
 
 def _send(connection: socket.socket, kind: bytes, content: bytes) -> None:
     connection.sendall(struct.pack(">H", 3 + len(content)) + kind + content)
-
-
-def emulate_ur(*, host: str = "127.0.0.1", faults: tuple[str, ...] = (), time_scale: float = 1.0) -> None:
-    """Emulate a UR5 until it is ended; see ``UrEmulator``."""
-    run_until_signal(UrEmulator(host=host, faults=faults, time_scale=time_scale), lambda: f"ur {host}")

@@ -16,7 +16,7 @@ from hardware.cameras.ros2 import PICTURES
 from hardware.cameras.uvc import SYSFS_CAMERAS, port_of
 from hardware.errors import DeviceError
 from hardware.ros2.dds import Participant
-from scenes import list_experiments, list_objects, list_randomisations, list_sensors
+from scenes import list_specifications
 from scenes.plugins import plugin_lines
 from twin.errors import EXTRAS, ExtraError, RenderError
 from twin.optics.variants.variant import report
@@ -138,8 +138,8 @@ class Machine(ReadableResult):
 def examine_machine() -> Machine:
     """Look for packages, Mitsuba's variants, LLVM, a GPU, offscreen 3D, cameras, serial ports and ROS 2 topics. Opens no device."""
     rendering, can_render = _rendering()
-    for names in (list_sensors, list_objects, list_experiments, list_randomisations):
-        names()  # so that a clash of names is known
+    for kind in ("sensors", "objects", "experiments", "randomisations"):
+        list_specifications(kind)  # so that a clash of names is known
     devices = dict(zip(DEVICES, (cameras(), serial_ports(), ros2_topics()), strict=True))
     versions = {name: _version(name) for name in PACKAGES}
     return Machine(versions, rendering, can_render, probe_offscreen(), devices, _places(), cache_folder(), plugin_lines())

@@ -94,9 +94,8 @@ def examine_sensor(
         There is no such camera, or it delivers no frame.
     """
     if detector is not None and detector.method != "twin":
-        raise FrameError(
-            f"{detector.name}: tuned for method '{detector.method}', `pipeline` takes method 'twin'; run 'twin tune' without `method`"
-        )
+        remedy = "`pipeline` takes method 'twin'; run 'twin tune' without `method`"
+        raise FrameError(f"{detector.name}: tuned for method '{detector.method}', {remedy}")
     views = []
     if no_contact is not None and (pushes or twist is not None):
         sensor, view = register_files(sensor, no_contact, pushes, twist=twist, form=form, out=out)
@@ -123,15 +122,14 @@ def _write_page(folder: Path, found: Examination, frames: list[Frame], pipeline:
     page = Page(f"Health of {pipeline.spec.name}", "twin check", topic="TacTip twin: health", lead=lead)
     page.notice("What to do", [finding.remedy for finding in found.findings if finding.remedy], tone="bad" if found.failed else "")
     page.notice("Noted", found.notes)
-    rows = [(each.name, Cell(str(each.verdict), tones.get(each.verdict, "")), each.text) for each in found.findings]
-    columns = ["check", "verdict", "found"]
-    page.table([dict(zip(columns, row, strict=True)) for row in rows], columns)
+    verdicts = [Cell(str(each.verdict), tones.get(each.verdict, "")) for each in found.findings]
+    rows = [{"check": each.name, "verdict": cell, "found": each.text} for each, cell in zip(found.findings, verdicts, strict=True)]
+    page.table(rows, ["check", "verdict", "found"])
     page.section("Pins in the frames", "Green: found. Red: a lost pin's expected place. Yellow: spots that are no pins.")
-    shown = [frames[k] for k in spread_indices(len(frames), SHOWN)]
-    paths = [folder / f"frame-{k + 1}.png" for k in range(len(shown))]
-    for path, frame in zip(paths, shown, strict=True):
-        write_image(path, draw_overlay(frame, pipeline(frame), scale=2))
-    pictures = (PagePicture(path, f"Frame {frame.name} with its pins", frame.name) for path, frame in zip(paths, shown, strict=True))
+    pictures = []
+    for k, frame in enumerate((frames[k] for k in spread_indices(len(frames), SHOWN)), 1):
+        path = write_image(folder / f"frame-{k}.png", draw_overlay(frame, pipeline(frame), scale=2))
+        pictures.append(PagePicture(path, f"Frame {frame.name} with its pins", frame.name))
     page.figures(*pictures, layout="row")
     page.write(folder / "index.html")
 

@@ -160,10 +160,9 @@ class LeRobotArm(Connection):
         self.name = self.robot_type = type(arm.arm if isinstance(arm, SafeArm) else arm).__name__.lower()
         self.cameras = dict(cameras or {})
         self.calibration: dict[str, Any] = {}
-        limits = arm.limits if isinstance(arm, SafeArm) else None
         self._speed = (linear_mm_s, angular_deg_s)
-        if limits is not None:
-            self._speed = min(linear_mm_s, limits.linear_mm_s), min(angular_deg_s, limits.angular_deg_s)
+        if isinstance(arm, SafeArm):
+            self._speed = min(linear_mm_s, arm.limits.linear_mm_s), min(angular_deg_s, arm.limits.angular_deg_s)
         self._newest = NewestTarget(arm, *self._speed)
         self._keys = _POSE if arm.axes == 6 else tuple(key for key in _POSE if key not in ("rx", "ry"))
 
@@ -245,7 +244,6 @@ class LeRobotArm(Connection):
     def _shape(self, name: str) -> tuple[int, int, int]:
         camera = self.cameras[name]
         if camera.height is None or camera.width is None:
-            raise DeviceError(
-                f"camera '{name}': its size is not known before it is connected; name its sensor, or give its width and height"
-            )
+            remedy = "name its sensor, or give its width and height"
+            raise DeviceError(f"camera '{name}': its size is not known before it is connected; {remedy}")
         return camera.height, camera.width, 3

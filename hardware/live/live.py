@@ -1,15 +1,19 @@
 """Watches a camera, or replays a session: from a plan to estimates, figures and, if requested, a recorded session.
 
-``watch`` runs the model on every frame. ``LiveSession`` is its loop; ``Shower`` shows the newest frame from its own thread.
+``watch`` runs the model on every frame. ``LiveSession`` is its loop; ``Shower`` shows the newest frame from its own thread, on a page or in
+Rerun (``rerun-sdk``, an optional package).
 """
 
+import re
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
+from socket import create_connection
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -17,18 +21,17 @@ from hardware.cameras.choose import open_camera
 from hardware.cameras.recorded import SessionSource
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.errors import DeviceError
-from hardware.live.rerun_view import RerunView
 from hardware.servo.timing import TimeSpread, Timing
 from hardware.workcell.build import load_rest_frame
 from hardware.workcell.ros2 import publishing
-from twin.errors import ErrorsAs, FrameError, OptionError, TwinError, format_count
+from twin.errors import ErrorsAs, FrameError, OptionError, TwinError, format_count, library
 from twin.estimate import Estimate, Estimator, SensorModel, pins_in, readable_labels
 from twin.pins import Pipeline
 from twin.records import KeptAlso
 from twin.records.session import SESSION_FILES, SessionWriter
 from twin.store import output
 from twin.studio.live_page import LiveFrame, LivePage
-from twin.types import FIRST, NONE, Frame
+from twin.types import FIRST, NONE, Frame, Observation
 
 # Number of newest times of each kind from which the figures are computed.
 KEPT_TIMES = 10_000
@@ -42,8 +45,95 @@ CLOSE_S = 20.0
 FRAME_TIMEOUT_S = 5.0
 # Port of the page that shows the frames.
 PORT = 8080
+# Values of the option `rerun`: the viewer of this machine, and the end of a file's name.
+VIEWER, SUFFIX = "viewer", ".rrd"
+# Longest wait, s, for a viewer, at the start and at the end. A new viewer needs a second or two.
+ANSWER_S = 8.0
+
+
+class RerunView:
+    """Logs frames and estimates to Rerun. A context manager.
+
+    Parameters
+    ----------
+    title : str
+    target : str
+        ``viewer`` (opened on this machine), a new file ``*.rrd``, or the address of a running viewer (``rerun+http://...``).
+
+    Raises
+    ------
+    ExtraError
+        The package is missing.
+    OptionError, DeviceError
+        The target is none of these, or the file already exists.
+    """
+
+    def __init__(self, title: str, target: str) -> None:
+        if target != VIEWER and "://" not in target and not target.endswith(SUFFIX):
+            raise OptionError(f"`rerun` {target}: expected '{VIEWER}', a file *{SUFFIX} or an address rerun+http://...")
+        if target.endswith(SUFFIX) and "://" not in target and Path(target).exists():
+            raise DeviceError(f"`rerun` {target}: exists already; give a new file, or remove it")
+        self._rerun, self._target = library("rerun"), target
+        self._stream = self._rerun.RecordingStream(re.sub(r"\W+", "-", title))
+        self.url = "Rerun's viewer" if target == VIEWER else target
+
+    def __enter__(self) -> "RerunView":
+        """Open the target.
+
+        Raises
+        ------
+        DeviceError
+            No viewer answers at the address, or the file can't be written.
+        """
+        stream = self._stream
+        try:
+            if self._target == VIEWER:
+                stream.spawn()
+            elif "://" in self._target:
+                with create_connection(_address(self._target), timeout=ANSWER_S):  # reports a refusal at once and in few words
+                    stream.connect_grpc(self._target)
+            else:
+                Path(self._target).parent.mkdir(parents=True, exist_ok=True)
+                stream.save(self._target)
+            stream.flush(timeout_sec=ANSWER_S)  # connecting itself reports no error, but flushing does
+        except (RuntimeError, OSError, ValueError) as error:
+            remedy = "start a viewer ('rerun' prints its address) and give rerun+http://HOST:9876/proxy, or a file"
+            raise DeviceError(f"`rerun` {self._target}: can't be opened ({error}); {remedy} *{SUFFIX}") from error
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        try:
+            self._stream.flush(timeout_sec=ANSWER_S)
+        except RuntimeError as error:
+            raise DeviceError(f"`rerun` {self._target}: closed before the end ({error}); the last pictures are missing there") from error
+        finally:
+            self._stream.disconnect()
+
+    def show(self, live: LiveFrame, seen: Observation) -> None:
+        """Log a frame with its pins and graph, the estimate's values with their intervals, and the lines, on ``frame`` and ``time``."""
+        rerun, stream, frame, estimate = self._rerun, self._stream, live.frame, live.estimate
+        stream.set_time("frame", sequence=frame.sequence)
+        stream.set_time("time", duration=frame.time_s)
+        stream.log("camera", rerun.Image(frame.image))
+        if seen.valid and seen.graph is not None:
+            nodes = seen.graph.nodes_px
+            stream.log("camera/edges", rerun.LineStrips2D(nodes[np.asarray(seen.graph.edges)]))
+            stream.log("camera/pins", rerun.Points2D(nodes))
+        for name, value, low, high in zip(estimate.names, estimate.value, estimate.low, estimate.high, strict=True):
+            stream.log(f"pose/{name}", rerun.Scalars([value, low, high]))
+        stream.log("figures", rerun.TextDocument("\n".join(live.lines)))
+
+
+def _address(target: str) -> tuple[str, int]:
+    """Host and port of a viewer's address; raises ``ValueError`` if it has none."""
+    parts = urlsplit(target)
+    if not parts.hostname or not parts.port:
+        raise ValueError("no host and port")
+    return parts.hostname, parts.port
+
 
 View = RerunView | LivePage
+Hear = Callable[[Frame, Estimate], None]
 
 
 @dataclass
@@ -63,7 +153,7 @@ class LiveSession:
     source: FrameSource
     estimator: Estimator
     record: SessionWriter | None = None
-    on_estimate: Callable[[Frame, Estimate], None] | None = None
+    on_estimate: Hear | None = None
     newest: tuple[Frame, Estimate] | None = None
     count: int = 0
     valid: int = 0
@@ -144,14 +234,11 @@ def estimate_line(estimate: Estimate) -> dict:
 
 def same_estimates(steps: list[dict], values: list[np.ndarray]) -> int:
     """Number of steps of a session whose stored estimates equal exactly the present ones (K,)."""
-    same = 0
-    for step, value_now in zip(steps, values, strict=False):
-        kept = np.array([np.nan if value is None else value for value in step.get("value", [])], float)
-        same += np.array_equal(kept, value_now, equal_nan=True)
-    return same
+    kept = (np.array(step.get("value", []), float) for step in steps)  # None becomes NaN
+    return sum(np.array_equal(then, now, equal_nan=True) for then, now in zip(kept, values, strict=False))
 
 
-class Shower:
+class Shower(AbstractContextManager["Shower"]):
     """Shows the newest frame from its own thread, so that drawing does not delay the session. A context manager.
 
     Parameters
@@ -169,7 +256,7 @@ class Shower:
 
     def __init__(self, session: LiveSession, pipeline: Pipeline, view: View) -> None:
         self._session, self._pipeline, self._view = session, pipeline, view
-        self._opened, self._end = threading.Event(), threading.Event()
+        self._end = threading.Event()
         self._thread = threading.Thread(target=self._run, name="view", daemon=True)
         self._error: Exception | None = None
 
@@ -179,47 +266,39 @@ class Shower:
         return not self._end.is_set()
 
     def __enter__(self) -> "Shower":
+        self._view.__enter__()
         self._thread.start()
-        self._opened.wait()
-        self._raise_error()
         return self
 
     def __exit__(self, kind: type | None, *_: object) -> None:
         self._end.set()
         self._thread.join(timeout=CLOSE_S)
-        if kind is None:
-            self._raise_error()
-
-    def _raise_error(self) -> None:
-        """Raise the error with which the view ended, if there is one."""
-        if isinstance(self._error, TwinError):
+        if kind is None and self._error is not None:
             raise self._error
-        if self._error is not None:
-            raise DeviceError(f"the view failed ({self._error}); without `rerun`, `headless` shows nothing") from self._error
 
     def _run(self) -> None:
         try:
-            self._show()
-        except Exception as error:
+            with ExitStack() as stack:
+                stack.push(self._view)
+                self._show()
+        except TwinError as error:
             self._error = error
-            self._end.set()
-        finally:
-            self._opened.set()
+        except Exception as error:
+            self._error = DeviceError(f"the view failed ({error}); without `rerun`, `headless` shows nothing")
+        self._end.set()
 
     def _show(self) -> None:
         shown = None
-        with self._view as view:
-            self._opened.set()
-            while not self._end.wait(SHOW_S):
-                newest = self._session.newest
-                if newest is None or newest is shown:
-                    continue
-                try:
-                    lines = self._session.lines(newest[1])
-                except RuntimeError:  # the session added a time while the times were read
-                    continue
-                shown = newest
-                view.show(LiveFrame(*newest, tuple(lines[1:])), pins_in(*newest, self._pipeline))
+        while not self._end.wait(SHOW_S):
+            newest = self._session.newest
+            if newest is None or newest is shown:
+                continue
+            try:
+                lines = self._session.lines(newest[1])
+            except RuntimeError:  # the session added a time while the times were read
+                continue
+            shown = newest
+            self._view.show(LiveFrame(*newest, tuple(lines[1:])), pins_in(*newest, self._pipeline))
 
 
 @dataclass(frozen=True)
@@ -323,12 +402,7 @@ class WatchResult:
 
 
 def watch(
-    plan: WatchPlan,
-    model: SensorModel,
-    *,
-    name: str = "",
-    on_shown: Callable[[str], None] | None = None,
-    on_estimate: Callable[[Frame, Estimate], None] | None = None,
+    plan: WatchPlan, model: SensorModel, *, name: str = "", on_shown: Callable[[str], None] | None = None, on_estimate: Hear | None = None
 ) -> WatchResult:
     """Estimate the pose in every frame that the camera or the session delivers, until the plan's end or Ctrl-C.
 

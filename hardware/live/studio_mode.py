@@ -67,10 +67,8 @@ class WatchedArm:
     """
 
     def __init__(self, text: str, source: FrameSource | None = None, pipeline: Pipeline | None = None) -> None:
-        arm, kind = open_arm(text), kind_of(text)
-        self._arm = SafeArm(arm, load_limits(kind))
-        self.name = self._arm.name
-        self.armed = False
+        self._arm = SafeArm(open_arm(text), load_limits(kind_of(text)))
+        self.name, self.armed = self._arm.name, False
         self._moves = threading.Lock()
         self._source, self._pipeline = source, pipeline
         self._eyes = FreshFrames(self._arm, source) if source is not None else None
@@ -202,13 +200,13 @@ class CameraFeed:
         model = PinsAlone(sensor, self._source.form, lacking) if model is None else model.seeking_rest()
         model.check(sensor, self._source.form)
         self.model = model
+        self.pipeline = Pipeline(model.sensor, model.form, model.pipeline.reference)  # a separate one for the page's thread
         self.robot = WatchedArm(arm, self._source, model.pipeline) if arm else None
         self.name = self._source.name + (f" and {self.robot.name}" if self.robot else "")
         self._session = LiveSession(self._source, model)
         self.ended = ""  # why no more frames come
         self._writer: SessionWriter | None = None
-        self._writing = threading.Lock()
-        self._end = threading.Event()
+        self._writing, self._end = threading.Lock(), threading.Event()
         self._thread: threading.Thread | None = None
 
     def start(self, on_frame: Callable[[LiveFrame], None], on_end: Callable[[str], None]) -> None:
@@ -309,7 +307,6 @@ class LiveMode(PageMode):
         self._twin, self._out = twin, plan.out
         self._feed: CameraFeed | None = None
         self._connecting = threading.RLock()  # the page calls from many threads, and a feed that is forgotten would keep its arm
-        self._pipeline: Pipeline | None = None
         self._health: list[str] = []
         self._last: LiveFrame | None = None
         self._shots = self.newest(self._show, "live")
@@ -363,7 +360,6 @@ class LiveMode(PageMode):
             if contact.model is None and lacking == MODEL_LOADING:
                 raise TwinError(f"{MODEL_LOADING}; press 'Connect' again in a moment")
             feed = CameraFeed(self._camera.value.strip(), self._arm.value.strip(), contact.setup.sensor, contact.model, lacking)
-            self._pipeline = Pipeline(feed.model.sensor, feed.model.form, feed.model.pipeline.reference)
             self._feed = feed
             feed.start(self._shots.give, self._report_end)
             arm = "" if feed.robot is None else f"{feed.robot.name}: {feed.robot.limits()}"
@@ -435,12 +431,11 @@ class LiveMode(PageMode):
         self._robot().nudge("xyz".index(axis), float(by))
 
     def _show(self, shot: LiveFrame) -> None:
-        feed, pipeline = self._feed, self._pipeline
-        self._last = shot
-        if feed is None or pipeline is None or not self._active:
+        feed, self._last = self._feed, shot
+        if feed is None or not self._active:
             return
-        seen = pins_in(shot.frame, shot.estimate, pipeline)
-        pictures = frame_pictures(feed.model.sensor, pipeline.reference, shot.frame, seen)
+        seen = pins_in(shot.frame, shot.estimate, feed.pipeline)
+        pictures = frame_pictures(feed.model.sensor, feed.pipeline.reference, shot.frame, seen)
         robot = feed.robot
         numbers = [
             badge("ended" if feed.ended else "live", "moving") + (badge("recording", "moving") if self._record.value else ""),

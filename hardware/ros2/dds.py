@@ -11,7 +11,7 @@ from typing import Any
 from hardware.errors import DeviceError
 from scenes.files import quote
 from twin.errors import ErrorsAs, extras_named
-from twin.records.ros2_messages import fields_of
+from twin.records.ros2 import fields_of
 
 DOMAIN_VARIABLE = "ROS_DOMAIN_ID"
 LOCAL_VARIABLE = "ROS_LOCALHOST_ONLY"

@@ -216,35 +216,18 @@ class Sensed:
         return cls(depth_mm, frame_time_s, float(np.linalg.norm(force)), torque, *slip)
 
 
-@dataclass(frozen=True)
-class _ReadingRule:
-    """The reaction of the arm if a value of the contact exceeds a limit. Both are named by their attributes. NaN never exceeds a limit."""
-
-    name: str
-    limit: str
-    action: Action
-    code: DecisionCode
-    text: str
-
-    def limit_decision(self, sensed: Sensed, limits: SafetyLimits) -> Decision | None:
-        """The decision if the limit is exceeded."""
-        reading, limit = getattr(sensed, self.name), getattr(limits, self.limit)
-        return None if limit is None or not reading > limit else Decision(self.action, self.code, self.text.format(reading, limit))
-
-
 _TURNED, _STILL = "the torque about the sensor's axis is {0:.0f} N mm", "the arm holds still above {1:g}"
 _SLIDES = "the contact begins to slide (probability {0:.0%}, allowed {1:.0%}); press harder"
-# The rules, in the order of their priority.
+_SLIPS = "{0:.0%} of the contact slides (allowed {1:.0%}); press harder"
+# The arm's reaction if a value of the contact exceeds a limit, in the order of priority. Value and limit are named by their attributes.
 _RULES = (
-    _ReadingRule("depth_mm", "contact_mm", Action.RETRACT, DecisionCode.TOO_DEEP, "the contact is {0:.1f} mm deep (allowed {1:g} mm)"),
-    _ReadingRule("force_n", "force_n", Action.RETRACT, DecisionCode.TOO_STRONG, "the force on the sensor is {0:.1f} N (allowed {1:g} N)"),
-    _ReadingRule("turning_nmm", "torque_nmm", Action.RETRACT, DecisionCode.TOO_TWISTED, f"{_TURNED} (allowed {{1:g}} N mm)"),
-    _ReadingRule("force_n", "hold_force_n", Action.HOLD, DecisionCode.HELD_FORCE, f"the force on the sensor is {{0:.1f}} N ({_STILL} N)"),
-    _ReadingRule("turning_nmm", "hold_torque_nmm", Action.HOLD, DecisionCode.HELD_FORCE, f"{_TURNED} ({_STILL} N mm)"),
-    _ReadingRule("slip_begins", "slip_begins", Action.HOLD, DecisionCode.SLIPPING, _SLIDES),
-    _ReadingRule(
-        "slip_share", "slip_share", Action.HOLD, DecisionCode.SLIPPING, "{0:.0%} of the contact slides (allowed {1:.0%}); press harder"
-    ),
+    ("depth_mm", "contact_mm", Action.RETRACT, DecisionCode.TOO_DEEP, "the contact is {0:.1f} mm deep (allowed {1:g} mm)"),
+    ("force_n", "force_n", Action.RETRACT, DecisionCode.TOO_STRONG, "the force on the sensor is {0:.1f} N (allowed {1:g} N)"),
+    ("turning_nmm", "torque_nmm", Action.RETRACT, DecisionCode.TOO_TWISTED, f"{_TURNED} (allowed {{1:g}} N mm)"),
+    ("force_n", "hold_force_n", Action.HOLD, DecisionCode.HELD_FORCE, f"the force on the sensor is {{0:.1f}} N ({_STILL} N)"),
+    ("turning_nmm", "hold_torque_nmm", Action.HOLD, DecisionCode.HELD_FORCE, f"{_TURNED} ({_STILL} N mm)"),
+    ("slip_begins", "slip_begins", Action.HOLD, DecisionCode.SLIPPING, _SLIDES),
+    ("slip_share", "slip_share", Action.HOLD, DecisionCode.SLIPPING, _SLIPS),
 )
 
 
@@ -278,13 +261,8 @@ def decide(
         target = finite_numbers("the target", target, 6)
     except DeviceError as error:
         return _refuse(DecisionCode.NOT_A_NUMBER, str(error))
-    unwrapped = kinematics is not None and kinematics.axes == 4
-    if kinematics is not None and unwrapped:
-        target = kinematics.nearest_pose(target)
-    pose, shortened = shorten(state.pose, target, limits, unwrapped=unwrapped)
-    if refused := _place(pose, state.pose, limits):
-        return refused
-    if kinematics is not None and (refused := _joints(pose, state.pose, limits, kinematics)):
+    pose, shortened = _on_turn(state.pose, target, limits, kinematics)
+    if refused := _place(pose, state.pose, limits) or _joints(pose, state.pose, limits, kinematics):
         return refused
     why = f"shortened to a step of {limits.step_mm} mm, {limits.step_deg} deg" if shortened else ""
     return Decision(Action.MOVE, DecisionCode.STEP_SHORTENED if shortened else DecisionCode.OK, why, pose)
@@ -300,15 +278,12 @@ def clip(target: np.ndarray, start: np.ndarray, limits: SafetyLimits, kinematics
         return pose
     low, high = np.array(limits.box_mm).T
     pose[:3] = np.clip(pose[:3], low, high)
-    unwrapped = kinematics is not None and kinematics.axes == 4
-    if kinematics is not None:
-        pose = kinematics.nearest_pose(pose)
-    pose, _ = shorten(start, pose, limits, unwrapped=unwrapped)
+    pose, _ = _on_turn(start, pose, limits, kinematics)
     way, allowed, refused = pose - start, 0.0, 2.0
     for _ in range(CLIP_HALVINGS + 1):  # the first trial is the whole path
         share = (allowed + refused) / 2
         at = start + share * way
-        if _place(at, start, limits) or (kinematics is not None and _joints(at, start, limits, kinematics)):
+        if _place(at, start, limits) or _joints(at, start, limits, kinematics):
             refused = share
         else:
             allowed = share
@@ -351,6 +326,13 @@ def shorten(start: np.ndarray, target: np.ndarray, limits: SafetyLimits, *, unwr
     return (start + min(shares) * way, True) if shares else (target.copy(), False)
 
 
+def _on_turn(start: np.ndarray, target: np.ndarray, limits: SafetyLimits, kinematics: Kinematics | None) -> tuple[np.ndarray, bool]:
+    """As ``shorten``, with the target on the turn of the last axis that is nearest to the middle of its range."""
+    if kinematics is None:
+        return shorten(start, target, limits)
+    return shorten(start, kinematics.nearest_pose(target), limits, unwrapped=kinematics.axes == 4)
+
+
 _refuse, _hold = partial(Decision, Action.REFUSE), partial(Decision, Action.HOLD)
 
 
@@ -367,7 +349,11 @@ def _halt(state: ArmState, limits: SafetyLimits, *, now_s: float, sensed: Sensed
         return None
     if not (age_s := now_s - sensed.frame_time_s) <= limits.frame_age_s:
         return _hold(DecisionCode.STALE_FRAME, f"the sensor's frame is {age_s:.2f} s old (allowed {limits.frame_age_s:g} s)")
-    return next(filter(None, (rule.limit_decision(sensed, limits) for rule in _RULES)), None)
+    for value, limit, action, code, text in _RULES:
+        reading, allowed = getattr(sensed, value), getattr(limits, limit)
+        if allowed is not None and reading > allowed:  # NaN never exceeds a limit
+            return Decision(action, code, text.format(reading, allowed))
+    return None
 
 
 def _place(pose: np.ndarray, start: np.ndarray, limits: SafetyLimits) -> Decision | None:
@@ -384,7 +370,9 @@ def _place(pose: np.ndarray, start: np.ndarray, limits: SafetyLimits) -> Decisio
     return None
 
 
-def _joints(pose: np.ndarray, start: np.ndarray, limits: SafetyLimits, kinematics: Kinematics) -> Decision | None:
+def _joints(pose: np.ndarray, start: np.ndarray, limits: SafetyLimits, kinematics: Kinematics | None) -> Decision | None:
+    if kinematics is None:
+        return None
     pose = kinematics.nearest_pose(pose)
     try:
         joints = kinematics.inverse(pose)

@@ -37,6 +37,8 @@ ARM_LOOK_S = 1.0
 # Waiting time in s after which the thread first reports what the program waits for. It reports again whenever that time has doubled.
 WORD_S = 1.5
 Result = TypeVar("Result")
+PoseAt = Callable[[float], np.ndarray]
+ContactAt = Callable[[np.ndarray], float]
 # Interval, s, at which the thread looks at the frames while the arm moves, and at which a wait for a fresh frame looks.
 LOOK_S = 0.01
 # Distance, mm, before the first touch at which the pieces begin, and the largest length of a piece.
@@ -189,13 +191,7 @@ class FreshFrames:
         counts as frozen after a travel in contact, even if pictures of this source may repeat.
     """
 
-    def __init__(
-        self,
-        arm: Arm,
-        source: FrameSource,
-        pose_at: Callable[[float], np.ndarray] | None = None,
-        contact_mm: Callable[[np.ndarray], float] | None = None,
-    ) -> None:
+    def __init__(self, arm: Arm, source: FrameSource, pose_at: PoseAt | None = None, contact_mm: ContactAt | None = None) -> None:
         self._arm, self._source, self._pose_at, self._contact_mm = arm, source, pose_at, contact_mm
         self._going, self._stopped = False, ""
 
@@ -273,9 +269,8 @@ class FreshFrames:
             self._stopped = f"{why}; {error}"
 
     def _error(self, why: str) -> BlindError:
-        return BlindError(
-            f"{self._source.name}: {why}; {self._arm.name} moves only with fresh frames; check the camera, and what else this computer does"
-        )
+        rule = f"{self._arm.name} moves only with fresh frames; check the camera, and what else this computer does"
+        return BlindError(f"{self._source.name}: {why}; {rule}")
 
 
 def pieces_to(start: np.ndarray, target: np.ndarray, near_mm: float) -> list[np.ndarray]:

@@ -16,7 +16,7 @@ import numpy as np
 from hardware.arms.arm import FEEDBACK_AGE_S, Arm, ArmState
 from hardware.arms.kinematics import Kinematics
 from hardware.errors import Connection, DeviceError, StaleDataError, also
-from hardware.rig.last_axis import LastAxis
+from hardware.rig.geometry import LastAxis
 from hardware.safety.decide import Action, Decision, DecisionCode, SafetyLimits, Sensed, clip, decide, decide_joints
 
 # Number of newest decisions that are kept in memory.
@@ -78,6 +78,9 @@ class LoggedDecision:
     decision: Decision
 
 
+DecisionLog = Callable[[LoggedDecision], None]
+
+
 class SafeArm(Connection):
     """Wraps an arm. Every move is checked before it is sent, and every decision is logged.
 
@@ -100,12 +103,7 @@ class SafeArm(Connection):
     """
 
     def __init__(
-        self,
-        arm: Arm,
-        limits: SafetyLimits,
-        *,
-        normal: Sequence[float] = (0.0, 0.0, 1.0),
-        log: Callable[[LoggedDecision], None] | None = None,
+        self, arm: Arm, limits: SafetyLimits, *, normal: Sequence[float] = (0.0, 0.0, 1.0), log: DecisionLog | None = None
     ) -> None:
         if limits.joints_deg is not None and len(limits.joints_deg) != arm.axes:
             raise DeviceError(f"{arm.name} has {arm.axes} joints, the limits are for {len(limits.joints_deg)}; give those of this arm")

@@ -15,10 +15,8 @@ from scipy.spatial.transform import Rotation
 from hardware.arms.open_arm import kind_of, open_arm
 from hardware.cameras.mjpeg import without_secrets
 from hardware.errors import DeviceError, in_short
-from hardware.rig.geometry import PlacedObject, shift_in_tool
-from hardware.rig.last_axis import LastAxis, poses_along, turns_back_mm
-from hardware.servo.loop import ServoLoop, require_labels
-from hardware.servo.step import LoopHooks, LoopSettings, StepRecord
+from hardware.rig.geometry import LastAxis, PlacedObject, poses_along, shift_in_tool, turns_back_mm
+from hardware.servo.loop import LoopHooks, LoopSettings, ServoLoop, StepRecord, require_labels
 from hardware.servo.timing import Timing
 from hardware.servo.trajectory import Measures, Trajectory, comparison_figure, measure, trajectory_figure, trajectory_of, write_csv
 from hardware.workcell.build import TWIN, DryRunDone, Rig, build_rig, check_plan, load_rest_frame
@@ -27,14 +25,14 @@ from scenes.files import quote
 from twin.errors import OptionError, StoreError, TwinError, format_count
 from twin.estimate import Estimate, SensorModel
 from twin.policy import KnownContacts, Policy, PolicyError, PolicyModel, load_policy
-from twin.progress import Progress, Step, silent, stage
+from twin.progress import Progress, silent, stage
 from twin.records import KeptAlso
 from twin.records.session import SessionWriter, plain
 from twin.report.charts import write_chart
 from twin.report.page import Page, PagePicture
 from twin.report.table import Cell, Column, write_rows
 from twin.rig.arm_pose import matrix_of, pose_of
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.store import write_json, writes
 from twin.types import FIRST, Frame, ReadableResult
 
@@ -160,10 +158,8 @@ class FollowPlan:
         if not self.camera:
             if kind_of(self.arm) != "simulated":
                 open_arm(self.arm)  # an arm that does not exist is reported first; nothing is opened
-                raise OptionError(
-                    f"`arm` {quote(self.arm)} needs a camera: give the sensor's with `camera`; `camera=twin` renders frames for the pose "
-                    "that the arm reports, and these do not show the real contact"
-                )
+                twin = "`camera=twin` renders frames for the pose that the arm reports, and these do not show the real contact"
+                raise OptionError(f"`arm` {quote(self.arm)} needs a camera: give the sensor's with `camera`; {twin}")
             object.__setattr__(self, "camera", TWIN)
 
 
@@ -195,11 +191,9 @@ class Followed:
         if np.isfinite(m.completed):
             round_mm = np.linalg.norm(np.diff(self.outline_mm, axis=0), axis=1).sum()
             out[0] += f", {self.path.along_mm.max():.0f} of {round_mm:.0f} mm along the outline, losses of contact: {m.lost_contacts:g}"
-            entries = f"path error {m.path_error_mm:.3f} mm; estimates off by {m.depth_error_mm:.3f} mm, {m.angle_error_deg:.2f} deg; "
-            out[2:2] = [
-                f"{entries if np.isfinite(m.path_error_mm) else ''}"  # a policy gives no estimate
-                f"held to {m.hold_depth_mm:.3f} mm, {m.hold_angle_deg:.2f} deg"
-            ]
+            off = f"path error {m.path_error_mm:.3f} mm; estimates off by {m.depth_error_mm:.3f} mm, {m.angle_error_deg:.2f} deg; "
+            off = off if np.isfinite(m.path_error_mm) else ""  # a policy gives no estimate
+            out.insert(2, f"{off}held to {m.hold_depth_mm:.3f} mm, {m.hold_angle_deg:.2f} deg")
         else:
             out[0] += "; the true position of the object is unknown, so errors against it are not measured (`known_place` if it is known)"
         return out + ([in_short(f"ended early: {self.failure}")] if self.failure else [])
@@ -246,7 +240,8 @@ def follow(
     steps = plan.steps or round_steps
     if plan.steps:
         wanted_mm = min(wanted_mm, plan.steps * plan.servo.feed_mm)
-    entries = _result_entries(plan, model) | (about or {})
+    entries = {"sensor": model.sensor.name, "object": plan.obj.name, "camera": without_secrets(plan.camera), "arm": plan.arm}
+    entries |= {"servo": plan.servo.model_dump()} | (about or {})
     failure, followed = "", None
     with rig, stage(progress, f"following the {plan.obj.name}") as step, ExitStack() as stack:
         takes_rest = plan.at_rest == FIRST and model.counts_from_rest and rig.source.is_live
@@ -261,9 +256,20 @@ def follow(
         session = stack.enter_context(SessionWriter(out / SESSION, entries)) if plan.record else None
         if session is not None and rest is not None:
             session.keep_rest(rest)
-        take_rest = partial(_take_rest, session, model) if takes_rest else None
+
+        def take_rest(frame: Frame) -> SensorModel:
+            """Store the frame that was taken clear of the object, and use its pins as the pins at rest."""
+            if session is not None:
+                session.keep_rest(frame)
+            return model.at_rest(frame)
+
+        def note_step(record: StepRecord, frame: Frame, estimate: Estimate) -> None:
+            if session is not None:
+                session.append(frame, asdict(record))
+            step(record.index + 1, steps)
+
         publish = stack.enter_context(rig.publishing(plan.ros2, model.pipeline))
-        hooks = LoopHooks(law, take_rest, partial(_note_step, session, step, steps), publish)
+        hooks = LoopHooks(law, take_rest if takes_rest else None, note_step, publish)
         period_s = 1.0 / (plan.stream_hz or STREAM_HZ)
         settings = LoopSettings(steps, plan.stream_hz is None, period_s, rig.frame_timeout_s, GIVE_UP_S)
         loop = ServoLoop(rig, plan.servo, model, settings, hooks)
@@ -298,12 +304,6 @@ def steps_round(placed: PlacedObject, servo: ServoSpec, rounds: float) -> tuple[
     return int(np.ceil(way_mm / servo.feed_mm)), rounds * length_mm
 
 
-def _result_entries(plan: FollowPlan, model: SensorModel) -> dict[str, Any]:
-    """The entries that are stored with the results."""
-    names = {"sensor": model.sensor.name, "object": plan.obj.name, "camera": without_secrets(plan.camera), "arm": plan.arm}
-    return names | {"servo": plan.servo.model_dump()}
-
-
 def _say_plan(plan: FollowPlan, rig: Rig, model: SensorModel, wanted_mm: float, steps: int, takes_rest: bool) -> None:
     """Check the plan and report it. Of the outline every ``CHECK_MM`` is checked."""
     planned = [pose for distance, pose in poses_along(rig.placed, plan.servo.indent_mm, wanted_mm)]
@@ -324,19 +324,6 @@ def _say_turns(rig: Rig, servo: ServoSpec, wanted_mm: float) -> None:
     axis = LastAxis(getattr(rig.arm, "kinematics", None), rig.mounting.centre_mm)
     for distance_mm in turns_back_mm(rig.placed, axis, servo.indent_mm, wanted_mm):
         LOG.warning("%s: its last axis will turn back by a full turn after about %.0f mm, clear of the object", rig.arm.name, distance_mm)
-
-
-def _note_step(session: SessionWriter | None, step: Step, steps: int, record: StepRecord, frame: Frame, estimate: Estimate) -> None:
-    if session is not None:
-        session.append(frame, asdict(record))
-    step(record.index + 1, steps)
-
-
-def _take_rest(session: SessionWriter | None, model: SensorModel, frame: Frame) -> SensorModel:
-    """Store the frame that was taken clear of the object, and use its pins as the pins at rest."""
-    if session is not None:
-        session.keep_rest(frame)
-    return model.at_rest(frame)
 
 
 def _results(plan: FollowPlan, rig: Rig, loop: ServoLoop, wanted_mm: float, failure: str) -> Followed:
@@ -448,13 +435,11 @@ def study_servo(plan: ServoStudyPlan, out: Path, *, progress: Progress = silent)
     reasons = [said for said in found.values() if isinstance(said, str)]
     if reasons and len(reasons) == len(found):
         raise TwinError(f"none of {format_count(len(found), 'runs')} made a step; the first: {reasons[0]}")
-    made = ServoStudy(found, [])
-    made.written.append(write_rows(out / "study.csv", made.rows))
+    study = ServoStudy(found, [])
     pictures = [(*key, run.path, run.outline_mm) for key, run in found.items() if isinstance(run, Followed)]
-    if pictures:
-        made.written.append(write_chart(out / "study.png", partial(comparison_figure, pictures)))
-    made.written.insert(0, _write_study(out, made))
-    return made
+    files = [write_rows(out / "study.csv", study.rows), write_chart(out / "study.png", partial(comparison_figure, pictures))]
+    study.written.extend([_write_study(out, study), *files])
+    return study
 
 
 def _write_study(out: Path, study: ServoStudy) -> Path:
@@ -469,11 +454,9 @@ def _write_study(out: Path, study: ServoStudy) -> Path:
         else:
             page_of_run = Cell(name, href=f"{folder_name(model)}/{name}/index.html")
             rows.append({"model": model, "object": page_of_run, "end": run.failure or "all steps made", **asdict(run.measures)})
-    page.table(
-        rows, ["model", "object", *columns, "end"], caption="Smoothness is the paper's S; local smoothness does not depend on the axes."
-    )
-    if (out / "study.png") in study.written:
-        page.figures(PagePicture(out / "study.png", "The tool's path (thin) around each object (wide), for each model", width_px=1000))
+    caption = "Smoothness is the paper's S; local smoothness does not depend on the axes."
+    page.table(rows, ["model", "object", *columns, "end"], caption=caption)
+    page.figures(PagePicture(out / "study.png", "The tool's path (thin) around each object (wide), for each model", width_px=1000))
     page.download(out / "study.csv", "all measures")
     return page.write(out / "index.html")
 

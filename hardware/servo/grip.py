@@ -1,5 +1,7 @@
 """A loop for several sensors on a gripper that an arm carries: a frame of each sensor, their pins, a decision, a move and a width.
 
+A gripper is at a digital output, behind ROS 2, in a scene, or of another package.
+
 The arm moves only while all cameras give fresh frames. If one does not, or its pins are not found, arm and gripper hold still, and the loop
 ends with an error if that lasts. At the end the arm is stopped and disabled; the gripper keeps its width, so that it drops nothing. A
 ``SafeArm`` checks the workspace, the step, the speed and the age of the oldest frame before each move. It gets no depth and no force: the
@@ -13,33 +15,127 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import cast
+from types import SimpleNamespace
+from typing import Protocol, cast
 
 import numpy as np
 
-from hardware.arms.arm import Arm, ArmState
+from hardware.arms.arm import POLL_S, Arm, ArmState
+from hardware.arms.mg400 import MG400
 from hardware.arms.open_arm import kind_of
+from hardware.arms.ros2 import CONNECT_S, topic_in
 from hardware.cameras.choose import open_camera
 from hardware.cameras.source import FrameSource, no_frame
 from hardware.cameras.twin import TwinCamera
 from hardware.errors import DeviceError
+from hardware.ros2.dds import Participant, Writer
 from hardware.safety.decide import Sensed
 from hardware.safety.eyes import ArmWatch, FreshFrames
 from hardware.safety.safe_arm import SafeArm, try_each
-from hardware.servo.grippers import Gripper, open_gripper
 from hardware.workcell.build import FRAME_S, TWIN_FRAME_S, DryRunDone, check_standing, open_guarded_arm
 from hardware.workcell.ros2 import publishing
 from scenes.files import quote
+from scenes.plugins import others
 from scenes.sensor import SensorSpec
-from twin.errors import OptionError
+from twin.errors import ErrorsAs, OptionError
 from twin.pins import Pipeline
 from twin.progress import Progress, silent, stage
 from twin.records import ALSO, KeptAlso
+from twin.records import ros2 as ros
 from twin.records.session import SessionWriter
 from twin.store import writes
 from twin.types import Form, Frame, Observation
 
 LOG = logging.getLogger(__name__)
+POSITIONS = "std_msgs/Float64MultiArray"
+GRIPPER_FORMS = "output:N,OPEN_MM,CLOSED_MM (a digital output of an MG400), ros2:TOPIC[,JOINTS]"
+
+
+class Gripper(Protocol):
+    """A parallel gripper. It is connected with the arm."""
+
+    name: str
+
+    @property
+    def width_mm(self) -> float:
+        """The width that was commanded last."""
+
+    def move(self, width_mm: float) -> None:
+        """Open or close to a width, as near to it as the gripper can. It returns at once."""
+
+
+class OutputGripper:
+    """A gripper that is open or closed, at a digital output of an MG400.
+
+    Parameters
+    ----------
+    arm : MG400 or SafeArm
+    output : int
+        Number of the output; its level is 1 while the gripper is closed.
+    open_mm, closed_mm : float
+        Its two widths. A width nearer to ``closed_mm`` closes it.
+    """
+
+    def __init__(self, arm: Arm, output: int, *, open_mm: float, closed_mm: float) -> None:
+        device = arm.arm if isinstance(arm, SafeArm) else arm
+        if not isinstance(device, MG400):
+            raise DeviceError(f"{arm.name}: has no digital outputs for a gripper; give an MG400")
+        self.name, self.width_mm = f"gripper at output {output} of {arm.name}", open_mm
+        self._arm, self._output, self._widths = device, output, (open_mm, closed_mm)
+
+    def move(self, width_mm: float) -> None:
+        self.width_mm = min(self._widths, key=lambda width: abs(width - width_mm))
+        self._arm.set_output(self._output, self.width_mm == self._widths[1])
+
+
+class Ros2Gripper:
+    """A gripper whose controller takes positions of its joints from a topic, as ``forward_command_controller`` does. It connects at a move.
+
+    Parameters
+    ----------
+    topic : str
+        Topic of ``std_msgs/Float64MultiArray``.
+    joints : int
+        Number of joints, m, that share the width equally: 1 if the controller takes the width itself, 2 for two fingers.
+    """
+
+    def __init__(self, topic: str, joints: int = 1) -> None:
+        self._topic, self._joints, self.width_mm = topic_in("", topic), joints, float("nan")
+        self.name = f"ROS 2 gripper at {self._topic}"
+        self._writer: Writer | None = None
+
+    def move(self, width_mm: float) -> None:
+        self._writer = self._writer or Participant().writer(self._topic, POSITIONS)
+        until_s = time.monotonic() + CONNECT_S
+        while not self._writer.heard:
+            if time.monotonic() > until_s:
+                raise DeviceError(f"{self.name}: nobody takes {POSITIONS} there; start its controller, or name its topic of commands")
+            time.sleep(POLL_S)
+        self._writer.write(ros.encode(POSITIONS, {"data": np.full(self._joints, width_mm / ros.MM_PER_M / self._joints)}), time.time_ns())
+        self.width_mm = width_mm
+
+
+def open_gripper(text: str, arm: Arm, sensor: SensorSpec) -> Gripper:
+    """A gripper from its specification: one of ``GRIPPER_FORMS``, or ``NAME:REST`` of a plug-in (``scenes.plugins``).
+
+    Raises
+    ------
+    DeviceError
+        The specification is not understood, or the arm has no outputs.
+    """
+    kind, _, rest = text.partition(":")
+    if kind in (there := others("grippers", ("output", "ros2"))):
+        gripper: Gripper = there[kind](rest, sensor)
+        return gripper
+    first, *numbers = rest.split(",")
+    with ErrorsAs(ValueError, lambda _: DeviceError(f"no gripper '{quote(text)}'; there are: {', '.join((GRIPPER_FORMS, *there))}")):
+        if kind == "output":
+            open_mm, closed_mm = map(float, numbers)
+            return OutputGripper(arm, int(first), open_mm=open_mm, closed_mm=closed_mm)
+        if kind == "ros2":
+            (joints,) = map(int, numbers or ["1"])
+            return Ros2Gripper(first, joints)
+        raise ValueError(kind)
 
 
 @dataclass(frozen=True)
@@ -73,18 +169,6 @@ class GripStep:
 
 Decide = Callable[[GripStep], tuple[np.ndarray, float]]
 """The tool's motion (6,) in the arm's base frame, mm and deg, and the gripper's next width, mm."""
-
-
-@dataclass(frozen=True)
-class _AllSources:
-    """The cameras as one, with all that ``FreshFrames`` uses: it is blind if any of them is."""
-
-    sources: Mapping[str, FrameSource]
-    name = "cameras"
-    same_s = None
-
-    def blind(self) -> str:
-        return "; ".join(f"{name}: {why}" for name, source in self.sources.items() if (why := source.blind()))
 
 
 def run_gripper(
@@ -129,16 +213,20 @@ def run_gripper(
         The arm fails or refuses a move, or there are no frames or no valid pins for too long.
     """
     found: list[GripStep] = []
+
+    def blind() -> str:
+        return "; ".join(f"{name}: {why}" for name, source in rig.sources.items() if (why := source.blind()))
+
+    cameras = cast(FrameSource, SimpleNamespace(name="cameras", same_s=None, blind=blind))  # as one: it is blind if any of them is
     with ExitStack() as stack:
         stack.enter_context(rig.connect())
         about = {"arm": rig.arm.name, "gripper": rig.gripper.name, "sensors": list(rig.sources)}
+        watch, eyes = ArmWatch(rig.arm), FreshFrames(rig.arm, cameras)
         records = {}
         for name, source in rig.sources.items():
             if out is not None:
                 entries = about | {"sensor": pipelines[name].spec.name, "camera": source.name}
                 records[name] = stack.enter_context(SessionWriter(out / name, entries))
-        watch, eyes = ArmWatch(rig.arm), FreshFrames(rig.arm, cast(FrameSource, _AllSources(rig.sources)))
-        for name, source in rig.sources.items():
             of = ros2 and f"{ros2}/{name}"
             stack.enter_context(publishing(of, source, pipelines[name], estimates=False, arm=lambda: watch.newest))
         stack.enter_context(watch.alert())

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from scenes.servo import ServoSpec
 from twin.rig.arm_pose import matrix_of, pose_of
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 
 
 @dataclass(frozen=True)
@@ -96,10 +96,8 @@ def servo_step(
     now = reading_at(mounting, T_base_surface, pose)
     error_mm, error_deg = spec.indent_mm - now.depth_mm, spec.angle_deg - now.angle_deg
     if fresh:
-        memory = Memory(
-            float(np.clip(memory.depth_mm + error_mm, -spec.integral_mm, spec.integral_mm)),
-            float(np.clip(memory.angle_deg + error_deg, -spec.integral_deg, spec.integral_deg)),
-        )
+        bounds = np.array([spec.integral_mm, spec.integral_deg])
+        memory = Memory(*np.clip([memory.depth_mm + error_mm, memory.angle_deg + error_deg], -bounds, bounds).tolist())
     press_mm = spec.kp_depth * error_mm + spec.ki_depth * memory.depth_mm
     turn_deg = spec.kp_angle * error_deg + spec.ki_angle * memory.angle_deg
     turn_deg = float(np.clip(turn_deg, -spec.largest_turn_deg, spec.largest_turn_deg))

@@ -6,6 +6,7 @@ frame's exposure from them. The thread of ``ArmWatch`` also stops an arm that no
 
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -14,25 +15,128 @@ import numpy as np
 from hardware.arms.arm import ArmState
 from hardware.cameras.source import no_frame
 from hardware.errors import DeviceError, StaleDataError
-from hardware.rig.last_axis import HOLD_DEG
+from hardware.rig.geometry import HOLD_DEG
 from hardware.safety.decide import DecisionCode, Sensed
 from hardware.safety.eyes import NEAR_MM as PIECES_MM
 from hardware.safety.eyes import BlindError, pieces_to
 from hardware.safety.safe_arm import RefusedMoveError
 from hardware.servo.law import Memory, Reading, servo_step, tangent_of
-from hardware.servo.step import LoopHooks, LoopSettings, StepRecord
 from hardware.servo.timing import TimeSpread, Timing
 from hardware.workcell.build import Rig
 from hardware.workcell.mover import MOVE_TIMEOUT_S, Mover
 from scenes.servo import ServoSpec
 from twin.errors import ErrorsAs
 from twin.estimate import Estimate, Estimator
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.types import Frame
 
 LOG = logging.getLogger(__name__)
 # Largest lag of the arm behind its target, in largest moves of the servo. An arm that lags farther gets no new target.
 BEHIND_MOVES = 2.0
+# Reasons for which a refused move only makes the arm hold still.
+HELD = (DecisionCode.STALE_FRAME, DecisionCode.SLIPPING, DecisionCode.HELD_FORCE)
+
+
+@dataclass(frozen=True, slots=True)
+class StepRecord:
+    """The record of one step.
+
+    Attributes
+    ----------
+    index : int
+    time_s : float
+        ``time.monotonic()`` when the command was given.
+    sequence : int
+        Sequence number of the frame on which the step was decided.
+    frame_s : float
+        Time of the frame's exposure.
+    age_s : float
+        Age of the frame when the loop received it.
+    fresh : bool
+        Whether no earlier step used the frame.
+    latency_s : float
+        Time from the exposure to the command.
+    compute_s : float
+        Time from receiving the frame to the command.
+    names : tuple of str
+        Names of the estimated labels.
+    value, low, high : (K,) float
+        The estimate and the limits of its interval; NaN if the estimate is not valid.
+    depth_mm, angle_deg : float
+        Estimated depth of the tool, and estimated angle between the tool and the surface's normal.
+    pose : (6,) float
+        The pose from which the step was decided: where the arm is, or the end of its present move.
+    exposed_pose : (6,) float
+        The arm's pose at the frame's exposure.
+    joints_deg : (J,) float
+    sent : (6,) float
+        The pose that was commanded.
+    """
+
+    index: int
+    time_s: float
+    sequence: int
+    frame_s: float
+    age_s: float
+    fresh: bool
+    latency_s: float
+    compute_s: float
+    names: tuple[str, ...]
+    value: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    depth_mm: float
+    angle_deg: float
+    pose: np.ndarray
+    exposed_pose: np.ndarray
+    joints_deg: np.ndarray
+    sent: np.ndarray
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """Settings of the loop.
+
+    Attributes
+    ----------
+    steps : int
+    blocking : bool
+        If true, the loop waits for the end of each move and takes a frame that was exposed after it. Otherwise it decides on the newest
+        frame every ``period_s``.
+    period_s : float
+    frame_timeout_s : float
+        Longest wait for a frame. It applies with ``blocking``, and to the first frame in any case.
+    give_up_s : float
+        The loop ends with an error after it has held still for this time.
+    """
+
+    steps: int
+    blocking: bool = True
+    period_s: float = 0.1
+    frame_timeout_s: float = 3.0
+    give_up_s: float = 3.0
+
+
+@dataclass(frozen=True)
+class LoopHooks:
+    """Functions that a loop calls.
+
+    Attributes
+    ----------
+    law : callable, optional
+        Replaces the servo law: gives the next pose (6,) from the arm's pose (6,) and the estimate.
+    take_rest : callable, optional
+        Gets a frame without contact, taken clear of the object, and returns the estimator to use from then on.
+    on_step : callable, optional
+        Called with each record, its frame and its estimate after the move was commanded.
+    on_estimate : callable, optional
+        Called with each used frame and its estimate, valid or not. It must return at once.
+    """
+
+    law: Callable[[np.ndarray, Estimate], np.ndarray] | None = None
+    take_rest: Callable[[Frame], Estimator] | None = None
+    on_step: Callable[[StepRecord, Frame, Estimate], object] | None = None
+    on_estimate: Callable[[Frame, Estimate], object] | None = None
 
 
 class Decided(StrEnum):
@@ -79,6 +183,11 @@ class ServoLoop:
     estimator : Estimator
     settings : LoopSettings
     hooks : LoopHooks, optional
+
+    Attributes
+    ----------
+    notes : list of str
+        Problems of the run.
     """
 
     def __init__(self, rig: Rig, servo: ServoSpec, estimator: Estimator, settings: LoopSettings, hooks: LoopHooks | None = None) -> None:
@@ -91,14 +200,9 @@ class ServoLoop:
         self._sent: np.ndarray | None = None  # pose (6,) where the arm's queue ends, if it has a queue
         self._behind_since: float | None = None  # when the arm began to lag too far behind for a new target
         self._view, self._memory = _NewestFrame(), Memory()
-        self._watch, self._axis = self.mover.watch, self.mover.axis
+        self._watch, self._axis, self.notes = self.mover.watch, self.mover.axis, self.mover.notes
         self._arrived_s: float | None = None  # when the arm came to the object; None once a frame exposed after that was used
         self._started_s = self._ended_s = 0.0
-
-    @property
-    def notes(self) -> list[str]:
-        """Problems of the run."""
-        return self.mover.notes
 
     def run(self, start_pose: np.ndarray) -> Timing:
         """Approach the start pose (6,), follow the surface for the number of steps of the settings, retreat.
@@ -162,7 +266,6 @@ class ServoLoop:
 
     def _follow(self) -> None:
         """Take frames and decide on each one, until all steps are made or the recording ends."""
-        self._view, self._memory, self._sent, self._behind_since = _NewestFrame(), Memory(), None, None
         self._started_s = self._arrived_s = due_s = time.monotonic()
         while len(self.records) < self.settings.steps:
             if not self.settings.blocking:
@@ -187,9 +290,9 @@ class ServoLoop:
             self._hold(self._view.doubt, None, age_s)
             return
         from_pose = state.pose if self._sent is None or not state.moving else self._sent
-        if self._lags(state, from_pose, taken_s):
+        if _apart_mm(from_pose, state.pose) > BEHIND_MOVES * self.servo.largest_move_mm:
             self.decided.append((Decided.AWAIT_ARM, age_s))
-            self._require_catching_up(taken_s)
+            self._await_arm(taken_s)
             return
         self._behind_since = None
         if not fresh and _apart_mm(from_pose, self._view.exposed_pose) + self.servo.feed_mm > self.servo.blind_mm:
@@ -202,13 +305,10 @@ class ServoLoop:
             return
         try:
             self._sent = self.mover.send(pose)
-        except BlindError as blind:
-            self._hold(str(blind), blind, age_s)
-            return
-        except RefusedMoveError as refused:
-            if refused.decision.code not in (DecisionCode.STALE_FRAME, DecisionCode.SLIPPING, DecisionCode.HELD_FORCE):
+        except (BlindError, RefusedMoveError) as error:
+            if isinstance(error, RefusedMoveError) and error.decision.code not in HELD:
                 raise
-            self._hold(str(refused), refused, age_s)
+            self._hold(str(error), error, age_s)
             return
         if self._held_since is not None:
             LOG.warning("%s: continues after %.1f s", self.arm.name, time.monotonic() - self._held_since)
@@ -249,21 +349,12 @@ class ServoLoop:
             self.mover.sense(Sensed.of(view.reading.depth_mm, frame.time_s, view.estimate.names, view.estimate.value))
         return True
 
-    def _lags(self, state: ArmState, from_pose: np.ndarray, now_s: float) -> bool:
-        """Whether the arm is too far behind its target to get a new one. The time at which this began is stored."""
-        if _apart_mm(from_pose, state.pose) <= BEHIND_MOVES * self.servo.largest_move_mm:
-            return False
+    def _await_arm(self, now_s: float) -> None:
+        """Note that the arm lags behind its target; raise ``DeviceError`` if it has done so for too long."""
         self._behind_since = now_s if self._behind_since is None else self._behind_since
-        return True
-
-    def _require_catching_up(self, now_s: float) -> None:
-        """Raise ``DeviceError`` if the arm has lagged behind for too long."""
-        behind_s = now_s - (now_s if self._behind_since is None else self._behind_since)
-        if behind_s > MOVE_TIMEOUT_S:
-            raise DeviceError(
-                f"{self.arm.name}: reports that it moves, but has not come near its target for {behind_s:.1f} s; look for an obstacle, "
-                "call clear_error(), then begin again"
-            )
+        if (behind_s := now_s - self._behind_since) > MOVE_TIMEOUT_S:
+            fault = f"reports that it moves, but has not come near its target for {behind_s:.1f} s"
+            raise DeviceError(f"{self.arm.name}: {fault}; look for an obstacle, call clear_error(), then begin again")
 
     def _record(self, state: ArmState, from_pose: np.ndarray, sent: np.ndarray, *, fresh: bool, taken_s: float) -> None:
         """Store the record of a move, and pass it to ``on_step``."""
@@ -360,10 +451,8 @@ class ServoLoop:
 def require_labels(mounting: Mounting, names: tuple[str, ...]) -> None:
     """Raise ``DeviceError`` unless a model has the labels that following needs. Call it before anything moves."""
     if not {mounting.depth_label, mounting.angle_label} <= set(names):
-        raise DeviceError(
-            f"the model estimates {', '.join(names)}; following a surface needs the experiment's {mounting.depth_label} and "
-            f"{mounting.angle_label}"
-        )
+        needed = f"{mounting.depth_label} and {mounting.angle_label}"
+        raise DeviceError(f"the model estimates {', '.join(names)}; following a surface needs the experiment's {needed}")
 
 
 def _apart_mm(one: np.ndarray, other: np.ndarray) -> float:

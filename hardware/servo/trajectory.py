@@ -4,7 +4,7 @@ The measures are the Tac-VGNN paper's smoothness S, and others that do not depen
 the trajectory, a zoom with its local smoothness, depth and angle.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +12,12 @@ from matplotlib.figure import Figure
 
 from hardware.rig.geometry import PlacedObject
 from hardware.servo.law import Reading, tangent_of
-from hardware.servo.step import StepRecord
+from hardware.servo.loop import StepRecord
 from twin.report.charts import muted_colour, new_figure
 from twin.report.table import write_table
 from twin.report.themes import BLUE, RED
 from twin.rig.arm_pose import matrix_of
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 
 # Number of points in a window of the local smoothness.
 LOCAL_N = 9
@@ -109,25 +109,16 @@ def trajectory_of(records: list[StepRecord], mounting: Mounting, placed: PlacedO
     """
     used = [record for record in records if record.fresh]
     poses = np.array([record.exposed_pose for record in used]).reshape(-1, 6)
-    depth, angle = (np.array([getattr(record, key) for record in used]) for key in ("depth_mm", "angle_deg"))
     felt = np.array([surface_place(mounting, record) for record in used]).reshape(-1, 3)
-    none = np.full(len(used), np.nan)
-    if placed is None:
-        return Trajectory(poses[:, :2], felt[:, :2], depth, angle, none, none, none, none, none)
-    touches = [placed.touch(pose) for pose in poses]
-    outline = placed.outline()
-    places = np.array([touch.place_mm for touch in touches]).reshape(-1, 3)
-    return Trajectory(
-        poses[:, :2],
-        felt[:, :2],
-        depth,
-        angle,
-        np.array([touch.depth_mm for touch in touches]),
-        np.array([touch.angle_deg for touch in touches]),
-        np.array([touch.indent_mm for touch in touches]),
-        np.array([abs(placed.distance_mm(place)) for place in felt]),
-        distance_along(outline, places[:, [0, 2]]),
-    )
+    estimated = (np.array([getattr(record, key) for record in used]) for key in ("depth_mm", "angle_deg"))
+    true = [np.full(len(used), np.nan)] * 5
+    if placed is not None:
+        touches = [placed.touch(pose) for pose in poses]
+        true = [np.array([getattr(touch, key) for touch in touches]) for key in ("depth_mm", "angle_deg", "indent_mm")]
+        true.append(np.array([abs(placed.distance_mm(place)) for place in felt]))
+        places = np.array([touch.place_mm for touch in touches]).reshape(-1, 3)
+        true.append(distance_along(placed.outline(), places[:, [0, 2]]))
+    return Trajectory(poses[:, :2], felt[:, :2], *estimated, *true)
 
 
 def surface_place(mounting: Mounting, record: StepRecord) -> np.ndarray:
@@ -214,12 +205,9 @@ def distance_along(outline_mm: np.ndarray, points_mm: np.ndarray) -> np.ndarray:
 def write_csv(path: Path, trajectory: Trajectory) -> Path:
     """Write the trajectory as a table, and return its path."""
     columns: dict[str, np.ndarray] = {}
-    for name, values in asdict(trajectory).items():
-        if values.ndim == 2:
-            stem = name.removesuffix("_mm")
-            columns |= {f"{stem}_x_mm": values[:, 0], f"{stem}_y_mm": values[:, 1]}
-        else:
-            columns[name] = values
+    for name, values in vars(trajectory).items():
+        stem = name.removesuffix("_mm")
+        columns |= {name: values} if values.ndim == 1 else {f"{stem}_x_mm": values[:, 0], f"{stem}_y_mm": values[:, 1]}
     steps = range(len(trajectory.tool_mm))
     return write_table(path, [{"step": k} | {name: float(values[k]) for name, values in columns.items()} for k in steps])
 
@@ -252,10 +240,9 @@ def trajectory_figure(path: Trajectory, measures: Measures, title: str, *, outli
         axes[1].set(xlim=(x - ZOOM_MM, x + ZOOM_MM), ylim=(y - ZOOM_MM, y + ZOOM_MM))
         axes[1].set_title(f"roughest: local S {slopes[worst]:.3f} (mean {measures.local_smoothness:.3f})")
     for ax, (estimated, true, name) in zip(axes[1 + rough :], courses, strict=False):
-        styles: list[dict] = [{"color": muted_colour(), "lw": 2, "label": "true"}, {"color": FELT, "label": "estimated"}]
-        for values, style in zip((true, estimated), styles, strict=True):
+        for values, colour, width, label in ((true, muted_colour(), 2, "true"), (estimated, FELT, None, "estimated")):
             if np.isfinite(values).any():
-                ax.plot(np.arange(len(values)), values, **style)
+                ax.plot(values, color=colour, lw=width, label=label)
         ax.set(xlabel="step", ylabel=name)
         ax.legend(fontsize=8)
     return figure

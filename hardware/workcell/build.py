@@ -23,8 +23,7 @@ from hardware.cameras.choose import open_camera
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.cameras.twin import PoseSource, TwinCamera, preview_of
 from hardware.errors import DeviceError, leave
-from hardware.rig.approach import path_around
-from hardware.rig.geometry import PlacedObject
+from hardware.rig.geometry import PlacedObject, path_around
 from hardware.safety.decide import Action, decide, load_limits
 from hardware.safety.eyes import NEAR_MM, ArmWatch
 from hardware.safety.safe_arm import RETREAT_SHARES, SafeArm
@@ -39,7 +38,7 @@ from twin.optics.preview import Preview
 from twin.optics.render import traced_shading
 from twin.pins import Pipeline
 from twin.rig.arm_pose import matrix_of
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.types import FIRST, NONE, Form, Frame
 
 # Value of ``camera`` that selects the twin.
@@ -181,7 +180,7 @@ def open_guarded_arm(arm: str, limits: str | None, *, at_once: bool) -> Arm:
     """An arm as for ``build_rig``, behind its limits unless it is simulated without any. ``at_once``: a simulated arm needs no time."""
     device = open_arm(arm)
     if isinstance(device, SimulatedArm) and at_once:
-        device = SimulatedArm(axes=device.axes, time_scale=np.inf, name=device.name)
+        device = SimulatedArm(axes=device.axes, time_scale=np.inf)
     if kind_of(arm) == "simulated" and limits is None:  # by its name: an arm of another package is guarded, whatever class it has
         return device
     return SafeArm(device, load_limits(limits or kind_of(arm)))

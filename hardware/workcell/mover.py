@@ -14,9 +14,7 @@ import numpy as np
 from hardware.arms.arm import ArmState
 from hardware.arms.motion import turn_between_deg
 from hardware.errors import DeviceError
-from hardware.rig.approach import path_around
-from hardware.rig.geometry import shift_in_tool
-from hardware.rig.last_axis import HOLD_DEG, LastAxis
+from hardware.rig.geometry import HOLD_DEG, LastAxis, path_around, shift_in_tool
 from hardware.safety.decide import Sensed
 from hardware.safety.eyes import ArmWatch, FreshFrames
 from hardware.safety.safe_arm import NoWayBackError, SafeArm, try_each

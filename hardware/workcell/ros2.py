@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from hardware.arms.arm import ArmState
-from hardware.cameras.coded import jpeg_of
+from hardware.cameras.mjpeg import jpeg_of
 from hardware.cameras.reader import LiveSource
 from hardware.cameras.source import FrameSource
 from hardware.ros2.dds import Participant, Writer
@@ -27,7 +27,7 @@ from twin.estimate import Estimate, pins_in, readable_labels
 from twin.frames.forms import recording_to_raw
 from twin.geometry.pins import rest_pins
 from twin.pins import Pipeline
-from twin.records import ros2_messages as ros
+from twin.records import ros2 as ros
 from twin.rig.arm_pose import matrix_of
 from twin.types import Form, Frame
 
@@ -53,7 +53,6 @@ _FORCES = ("Fx", "Fy", "Fz")
 _POINT = ("x", "y", "z", "u", "v", "du", "dv")
 _SPHERES, _LINES = 7, 5  # kinds of markers
 _FLOAT32 = 7  # kind of a number of a point
-_ARRAYS = ("pins", "estimate", "estimate_low", "estimate_high", "slip")
 SENSOR_TOPICS = {
     "image": "sensor_msgs/Image",
     "image/compressed": "sensor_msgs/CompressedImage",
@@ -62,7 +61,7 @@ SENSOR_TOPICS = {
 }
 """Topics in the profile for sensor data (best effort), and their messages."""
 TOPICS = {
-    **dict.fromkeys(_ARRAYS, "std_msgs/Float32MultiArray"),
+    **dict.fromkeys(("pins", "estimate", "estimate_low", "estimate_high", "slip"), "std_msgs/Float32MultiArray"),
     "pose": "geometry_msgs/TwistStamped",
     "contact_pose": "geometry_msgs/PoseWithCovarianceStamped",
     "wrench": "geometry_msgs/WrenchStamped",
@@ -240,22 +239,18 @@ class Ros2Publisher:
         for topic, row in zip(("estimate", "estimate_low", "estimate_high"), numbers, strict=True):
             self._send(topic, at_ns, partial(ros.number_array, row, ",".join(names)))
         if valid:
-            self._publish_valid(at_ns, names, numbers)
+            known, header = dict(zip(names, numbers[0].tolist(), strict=True)), ros.header_of(at_ns, self.sensor_frame)
+            if not _POSE.keys().isdisjoint(names):
+                self._send("pose", at_ns, lambda: {"header": header, "twist": ros.estimated_twist(known)})
+                self._send("contact_pose", at_ns, lambda: _contact_pose(ros.header_of(at_ns, self.contact_frame), names, numbers))
+            if all(name in known for name in _FORCES):
+                force_n = np.array([known[name] for name in _FORCES])
+                self._send("wrench", at_ns, lambda: {"header": header, "wrench": ros.wrench(force_n, np.full(3, np.nan))})
+                self._send("contact", at_ns, lambda: {"data": int(np.linalg.norm(force_n) > ros.TOUCHES_N)})
+            if slip := [name for name in names if name.startswith("slip_")]:
+                self._send("slip", at_ns, lambda: ros.number_array(np.array([known[name] for name in slip]), ",".join(slip)))
         self._publish_pins(at_ns, frame, estimate)
         self._publish_status(at_ns, estimate, valid)
-
-    def _publish_valid(self, at_ns: int, names: tuple[str, ...], numbers: np.ndarray) -> None:
-        known = dict(zip(names, numbers[0].tolist(), strict=True))
-        header = ros.header_of(at_ns, self.sensor_frame)
-        if any(name in _POSE for name in names):
-            self._send("pose", at_ns, lambda: {"header": header, "twist": ros.estimated_twist(known)})
-            self._send("contact_pose", at_ns, lambda: _contact_pose(ros.header_of(at_ns, self.contact_frame), names, numbers))
-        if all(name in known for name in _FORCES):
-            force_n = np.array([known[name] for name in _FORCES])
-            self._send("wrench", at_ns, lambda: {"header": header, "wrench": ros.wrench(force_n, np.full(3, np.nan))})
-            self._send("contact", at_ns, lambda: {"data": bool(np.linalg.norm(force_n) > ros.TOUCHES_N)})
-        if slip := [name for name in names if name.startswith("slip_")]:
-            self._send("slip", at_ns, lambda: ros.number_array(np.array([known[name] for name in slip]), ",".join(slip)))
 
     def _publish_status(self, at_ns: int, estimate: Estimate | None, valid: bool) -> None:
         def make() -> dict[str, Any]:

@@ -34,7 +34,7 @@ from stable_baselines3.common.vec_env import VecNormalize  # noqa: E402
 import training.environments  # noqa: E402, F401
 from training.environments.grasp import GRIP_S, PERIOD_S  # noqa: E402
 from training.environments.grasp import STEPS as STEPS_OF_EPISODE  # noqa: E402
-from training.mujoco.grasp import WANTED  # noqa: E402
+from training.mujoco.task import WANTED  # noqa: E402
 
 GRIPS_N = (0.8, 1.1, 1.5, 2.0)
 STEPS = 100_000

@@ -183,7 +183,7 @@ def print_scaling(repeats, out):
 
 def print_processes():
     """Wall-clock time of many contacts with one process and with two."""
-    from twin.mechanics.batch import ContactJob, press_many
+    from twin.mechanics.solver import ContactJob, press_many
 
     spec, plane = plain_sensor(), load_object("plane")
     tilts = np.linspace(-20, 20, JOBS).round(1).tolist()

@@ -18,7 +18,7 @@ from hardware.ros2.dds import Participant
 from hardware.workcell.ros2 import Ros2Publisher
 from scenes import load_sensor
 from twin.pins import Pipeline
-from twin.records.ros2_messages import decode
+from twin.records.ros2 import decode
 from twin.types import Form, Frame
 
 HZ = 30.0

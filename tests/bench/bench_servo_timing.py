@@ -58,12 +58,11 @@ def once(ros2: bool = False) -> dict[str, float]:
     from hardware.rig.geometry import PlacedObject
     from hardware.safety.decide import load_limits
     from hardware.safety.safe_arm import SafeArm
-    from hardware.servo.loop import ServoLoop
-    from hardware.servo.step import LoopHooks, LoopSettings
+    from hardware.servo.loop import LoopHooks, LoopSettings, ServoLoop
     from hardware.workcell.build import Rig
     from scenes import load_experiment, load_object, load_sensor, load_servo
     from twin.pins import Pipeline
-    from twin.rig.mounting import Mounting
+    from twin.rig.kinematics import Mounting
     from twin.types import Form
 
     servo = load_servo("surface")

@@ -20,8 +20,7 @@ from noisy_camera import NoisyCamera, number_of
 from hardware.arms.simulated import SimulatedArm
 from hardware.cameras import reader
 from hardware.cameras.choose import open_camera
-from hardware.cameras.coded import CONTENT_TYPE, Parts, jpeg_of, write_part
-from hardware.cameras.mjpeg import MjpegCamera
+from hardware.cameras.mjpeg import CONTENT_TYPE, MjpegCamera, Parts, jpeg_of, write_part
 from hardware.cameras.reader import FIRST_PERIODS, MOST_FAILED_READS, ReadFailed
 from hardware.cameras.source import FrameSource
 from hardware.cameras.twin import TwinCamera
@@ -37,7 +36,7 @@ from twin.contracts import CameraContract
 from twin.errors import FrameError
 from twin.frames.images import write_image
 from twin.records.session import SessionWriter
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.types import Form, Frame
 
 COUNT = 6  # frames of the recorded sources

@@ -28,12 +28,11 @@ from hardware.safety.decide import SafetyLimits, load_limits
 from hardware.safety.eyes import NEAR_MM, PIECE_MM, BlindError, FreshFrames, pieces_to
 from hardware.safety.safe_arm import SafeArm
 from hardware.servo.following import FollowPlan, follow
-from hardware.servo.loop import ServoLoop
-from hardware.servo.step import LoopHooks, LoopSettings
+from hardware.servo.loop import LoopHooks, LoopSettings, ServoLoop
 from hardware.workcell.build import Rig, check_plan
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 from twin.pins import Pipeline, measure_reference, nominal_reference
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.types import Form
 
 RUNS, HEALTHY_RUNS = 320, 20

@@ -15,11 +15,10 @@ from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject
 from hardware.safety.decide import DecisionCode, load_limits
 from hardware.safety.safe_arm import RefusedMoveError, SafeArm
-from hardware.servo.loop import ServoLoop
-from hardware.servo.step import LoopSettings
+from hardware.servo.loop import LoopSettings, ServoLoop
 from hardware.workcell.build import Rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 
 SPEED = 20.0  # of the emulated arm, times real
 STEPS = 6

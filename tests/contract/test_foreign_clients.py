@@ -278,9 +278,9 @@ def test_an_emulator_ends_on_a_signal_that_another_thread_gets():
     """Threads of numerical libraries don't block what the main thread waits for."""
     source = (
         "import threading, time, signal, contextlib; idle = threading.Thread(target=time.sleep, args=(3,), daemon=True); idle.start();"
-        "from hardware.emulators.running import run_until_signal;"
+        "from hardware.emulators.faults import Emulator;"
         "threading.Timer(0.2, lambda: signal.pthread_kill(idle.ident, signal.SIGTERM)).start();"
-        "run_until_signal(contextlib.nullcontext(), lambda: 'now')"
+        "device = contextlib.nullcontext(); device.place, device.error = 'now', None; Emulator.run(device)"
     )
     done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, timeout=30)
     assert done.returncode == 0 and done.stdout == "ready now\n", done.stderr
@@ -289,7 +289,8 @@ def test_an_emulator_ends_on_a_signal_that_another_thread_gets():
 def test_an_emulator_that_was_stopped_goes_on():
     """As by Ctrl-Z and ``bg``."""
     source = (
-        "import contextlib; from hardware.emulators.running import run_until_signal; run_until_signal(contextlib.nullcontext(), lambda: '')"
+        "import contextlib; from hardware.emulators.faults import Emulator;"
+        "device = contextlib.nullcontext(); device.place, device.error = '', None; Emulator.run(device)"
     )
     with subprocess.Popen([sys.executable, "-c", source], stdout=subprocess.PIPE) as process:
         try:

@@ -10,16 +10,14 @@ from true_estimator import TrueEstimator
 
 from hardware.arms.kinematics import MG400
 from hardware.emulators.mg400 import Mg400Emulator
-from hardware.rig.geometry import PlacedObject
-from hardware.rig.last_axis import HOLD_DEG, LastAxis, turns_back_mm
+from hardware.rig.geometry import HOLD_DEG, LastAxis, PlacedObject, turns_back_mm
 from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import SafeArm
 from hardware.servo.following import steps_round
-from hardware.servo.loop import ServoLoop
-from hardware.servo.step import LoopSettings
+from hardware.servo.loop import LoopSettings, ServoLoop
 from hardware.workcell.build import Rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 
 OBJECTS = ("can", "mesh-can", "square", "prism", "tin-box")
 SPEED = 20.0  # of the emulated arm, times real

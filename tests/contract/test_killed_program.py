@@ -83,8 +83,8 @@ def test_a_program_that_ends_as_it_should_leaves_no_supervisor(kind):
 
 def test_it_sends_nothing_when_it_is_ended_and_all_when_its_program_is_gone():
     ours, its = os.pipe()
-    Supervisor(its, (b"stop",)).end()
-    gone = f"import os; from hardware.arms.supervisor import Supervisor; Supervisor({its}, (b'stop', b'off')); os._exit(0)"
+    Supervisor(lambda: its, (b"stop",)).end()
+    gone = f"import os; from hardware.arms.supervisor import Supervisor; Supervisor(lambda: {its}, (b'stop', b'off')); os._exit(0)"
     subprocess.run([sys.executable, "-c", gone], pass_fds=(its,), check=True)
     os.close(its)
     with os.fdopen(ours, "rb") as pipe:

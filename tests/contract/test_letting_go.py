@@ -23,11 +23,10 @@ from hardware.live.studio_mode import CameraFeed
 from hardware.rig.geometry import PlacedObject
 from hardware.safety.decide import SafetyLimits
 from hardware.safety.safe_arm import SafeArm
-from hardware.servo.loop import ServoLoop
-from hardware.servo.step import LoopHooks, LoopSettings
+from hardware.servo.loop import LoopHooks, LoopSettings, ServoLoop
 from hardware.workcell.build import Rig
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.signals import signals_as_ctrl_c
 from twin.types import Form
 

@@ -15,13 +15,12 @@ from hardware.cameras.recorded import SessionSource
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject
-from hardware.servo.loop import Decided, ServoLoop
-from hardware.servo.step import LoopHooks, LoopSettings
+from hardware.servo.loop import Decided, LoopHooks, LoopSettings, ServoLoop
 from hardware.servo.trajectory import measure, trajectory_of, write_csv
 from hardware.workcell.build import Rig
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 from twin.records.session import Session, SessionWriter
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 
 SPEED = 20.0  # of the simulated arm, times real
 ALLOCATOR_BYTES = 4_000_000  # that it may take at a time

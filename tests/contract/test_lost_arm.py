@@ -18,11 +18,10 @@ from hardware.rig.geometry import PlacedObject
 from hardware.safety.decide import SafetyLimits
 from hardware.safety.eyes import ArmWatch
 from hardware.safety.safe_arm import SafeArm
-from hardware.servo.loop import ServoLoop
-from hardware.servo.step import LoopHooks, LoopSettings
+from hardware.servo.loop import LoopHooks, LoopSettings, ServoLoop
 from hardware.workcell.build import Rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.types import Form, Frame
 
 WORD_S = 1.0  # from the last valid feedback to the first word

@@ -15,7 +15,7 @@ from hardware.arms.mg400 import Mg400Ports
 from hardware.arms.mg400_link import CommandPort, Feedback
 from hardware.arms.mg400_wire import PACKET, PACKET_BYTES, TEST_VALUE, newest_packet, take_reply
 from hardware.emulators.mg400 import FAULTS, Mg400Emulator, feedback_packet
-from hardware.emulators.mg400_grammar import RefusedError
+from hardware.emulators.mg400_controller import RefusedError
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import SafeArm

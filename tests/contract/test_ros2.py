@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from any_message import messages
+from any_message import KINDS, messages
 from noisy_camera import NoisyCamera, number_of
 from rosbags.typesys import Stores, get_typestore
 from true_estimator import TrueEstimate
@@ -22,7 +22,7 @@ from drawn_frames import drawn_frame
 from hypothesis import HealthCheck, given, settings
 
 from hardware.cameras.choose import open_camera
-from hardware.cameras.coded import jpeg_of
+from hardware.cameras.mjpeg import jpeg_of
 from hardware.cameras.reader import LiveSource, ReadFailed
 from hardware.cameras.ros2 import Ros2Camera
 from hardware.errors import DeviceError
@@ -36,7 +36,7 @@ from twin.contracts import CameraContract
 from twin.errors import OptionError
 from twin.geometry.pins import rest_pins
 from twin.pins import Pipeline
-from twin.records.ros2_messages import DEFINITIONS, decode, encode, full_name
+from twin.records.ros2 import decode, encode, full_name
 from twin.types import Form, Frame
 
 ROS = get_typestore(Stores.ROS2_HUMBLE)
@@ -422,5 +422,5 @@ def test_a_published_sensor_is_a_camera(sensor):
 
 
 def test_messages_that_are_needed_are_defined():
-    assert {*SENSOR_TOPICS.values(), *TOPICS.values()} <= DEFINITIONS.keys()
+    assert {*SENSOR_TOPICS.values(), *TOPICS.values()} <= {*KINDS}
     assert decode("std_msgs/Int8", encode("std_msgs/Int8", {"data": -3})) == {"data": -3}

@@ -22,7 +22,7 @@ from hardware.errors import DeviceError, DeviceNotConnectedError
 from hardware.ros2.dds import Participant
 from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import SafeArm
-from twin.records import ros2_messages as ros
+from twin.records import ros2 as ros
 
 HOME = np.array([300.0, 0, 0, 0, 0, 0])
 AWAY = HOME + [0, 60, 0, 0, 0, 20]

@@ -11,7 +11,7 @@ from hardware.rig.geometry import PlacedObject, shift_in_tool
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor
 from twin.mechanics.follow import SETTLED_MM
 from twin.rig.contact import contact_law
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.types import Form
 
 DRAG_MM = 2.0  # along the plate: friction then acts across the sensor

@@ -18,13 +18,12 @@ from hardware.arms.ur.driver import NORMAL
 from hardware.arms.ur.kinematics import MODELS, UrKinematics, pose_from_ur, pose_to_ur
 from hardware.emulators.ur import UrEmulator
 from hardware.errors import DeviceError, DeviceNotConnectedError
-from hardware.rig.geometry import PlacedObject
-from hardware.rig.last_axis import poses_along
+from hardware.rig.geometry import PlacedObject, poses_along
 from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import SafeArm
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.errors import ExtraError
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 
 HOME = np.array([100.0, -500, 200, 0, 0, -160])
 AWAY = HOME + [0, 200, 0, 0, 0, 0]

@@ -194,7 +194,7 @@ def grasp_job(name: str, options: str, measure: Callable[[Path], Measured], minu
         f"grasp.{name}",
         f"tests/bench/bench_grasp.py {options}",
         sensors=("mg400-331",),
-        code=("bench_grasp", "training.mujoco.scene", "training.mujoco.task", "training.mujoco.grasp", "training.mujoco.peg"),
+        code=("bench_grasp", "training.mujoco.scene", "training.mujoco.task"),
         shipped=("training/surrogates/mg400-331.safetensors", "training/mujoco/scenes"),
         minutes=minutes,
         beside=DRAWN,

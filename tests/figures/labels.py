@@ -17,7 +17,7 @@ from training.studies.evaluation import models_of_kinds
 from training.studies.judging import measure_errors
 from training.studies.sim_to_real import SimToRealPlan
 from training.studies.sim_to_real.label_efficiency import label_efficiency
-from training.studies.sim_to_real.page import errors_figure
+from training.studies.sim_to_real.study import errors_figure
 from twin.frames import open_recording
 from twin.report.charts import write_chart
 from twin.store import write_json

@@ -4,7 +4,47 @@ from functools import cache
 
 from hypothesis import strategies as st
 
-from twin.records.ros2_messages import DEFINITIONS, fields_of
+from twin.records.ros2 import fields_of
+
+KINDS = (
+    "builtin_interfaces/Duration",
+    "builtin_interfaces/Time",
+    "diagnostic_msgs/DiagnosticArray",
+    "diagnostic_msgs/DiagnosticStatus",
+    "diagnostic_msgs/KeyValue",
+    "geometry_msgs/Point",
+    "geometry_msgs/Pose",
+    "geometry_msgs/PoseStamped",
+    "geometry_msgs/PoseWithCovariance",
+    "geometry_msgs/PoseWithCovarianceStamped",
+    "geometry_msgs/Quaternion",
+    "geometry_msgs/Transform",
+    "geometry_msgs/TransformStamped",
+    "geometry_msgs/Twist",
+    "geometry_msgs/TwistStamped",
+    "geometry_msgs/Vector3",
+    "geometry_msgs/Wrench",
+    "geometry_msgs/WrenchStamped",
+    "sensor_msgs/CompressedImage",
+    "sensor_msgs/Image",
+    "sensor_msgs/JointState",
+    "sensor_msgs/PointCloud2",
+    "sensor_msgs/PointField",
+    "std_msgs/ColorRGBA",
+    "std_msgs/Float32MultiArray",
+    "std_msgs/Float64MultiArray",
+    "std_msgs/Header",
+    "std_msgs/Int8",
+    "std_msgs/MultiArrayDimension",
+    "std_msgs/MultiArrayLayout",
+    "std_msgs/String",
+    "tf2_msgs/TFMessage",
+    "visualization_msgs/Marker",
+    "visualization_msgs/MarkerArray",
+    "visualization_msgs/MeshFile",
+    "visualization_msgs/UVCoordinate",
+)
+"""The messages that the program uses, with those in them."""
 
 RANGES = {
     "int8": (-128, 127),
@@ -24,7 +64,7 @@ def messages(kind):
 
 
 def _values(field):
-    if field.kind in DEFINITIONS:
+    if "/" in field.kind:
         one = messages(field.kind)
     elif field.kind == "string":
         one = NAMES

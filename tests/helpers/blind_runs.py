@@ -39,11 +39,10 @@ from hardware.rig.geometry import PlacedObject, shift_in_tool
 from hardware.safety.decide import SafetyLimits
 from hardware.safety.eyes import NEAR_MM
 from hardware.safety.safe_arm import SafeArm
-from hardware.servo.loop import ServoLoop
-from hardware.servo.step import LoopHooks, LoopSettings
+from hardware.servo.loop import LoopHooks, LoopSettings, ServoLoop
 from hardware.workcell.build import Rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.types import Form
 
 CAMERA_FAULTS = {

@@ -1,6 +1,6 @@
 """Small bodies of the skin's and the gel's own elements, slow, obvious ways to assemble them, and a solver that lets look inside."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from scenes.body import MaterialSpec
 from scenes.load import load_sensor
-from twin.geometry.bspline import Basis
-from twin.geometry.solid import Cells, _local, joined_cells, spline_cells
+from twin.geometry.solid import Basis, Cells, joined_cells, spline_cells
 from twin.mechanics import SkinSolver
 from twin.mechanics.body.elements import PAIRS, Elements
 from twin.mechanics.body.material import law_coefficients
@@ -68,18 +67,23 @@ def build_block(kind: str, *, breaks=None, depths=None, size_mm=(1.0, 1.0, 1.0),
     index = np.arange(len(control)).reshape(d.shape)
     layers = []
     for e in range(through.elements):
-        parts = [(index[e + k], basis, _local(through, e, k)) for k in range(through.degree + 1)]
+        parts = [(index[e + k], basis) for k in range(through.degree + 1)]
         layers.append(spline_cells(basis, parts, through, e, control))
     row, column = (g.ravel() for g in np.meshgrid(np.arange(basis.elements), np.arange(basis.elements), indexing="ij"))
     boxes = np.tile(np.column_stack([row, row + 1, column, column + 1]), (through.elements, 1))
     return Block(control, joined_cells(layers), index, boxes, basis, through)
 
 
+def loaded(elements: Elements, given: np.ndarray | None) -> Elements:
+    """Elements with a given stress, if there is one."""
+    return elements if given is None else replace(elements, stress=given)
+
+
 def stiffness_blocks(elements: Elements, control_mm: np.ndarray, *, given=None, pressure_mpa: float = 0.0) -> np.ndarray:
     """(m, 6, b, b) of all elements."""
     count, functions = elements.cells.controls.shape
     out = np.full((count, 6, functions, functions), np.nan)
-    elements.stiffness(control_mm, np.zeros((0, 8, 3, 3)) if given is None else given, pressure_mpa, out)
+    loaded(elements, given).stiffness(control_mm, pressure_mpa, out)
     return out
 
 
@@ -100,7 +104,7 @@ def assembled(controls: list[np.ndarray], blocks: list[np.ndarray], count: int) 
 def forces(elements: Elements, control_mm: np.ndarray, *, given=None, pressure_mpa: float = 0.0) -> tuple[float, np.ndarray]:
     """Energy and its gradient (n, 3)."""
     out = np.zeros_like(control_mm)
-    return elements.add_forces(control_mm, np.zeros((0, 8, 3, 3)) if given is None else given, out, pressure_mpa), out
+    return loaded(elements, given).add_forces(control_mm, out, pressure_mpa), out
 
 
 def rotation(axis, angle_rad: float) -> np.ndarray:
@@ -128,7 +132,7 @@ class Watched(SkinSolver):
         """Gradient of the elastic energy of the last state, (n, 3) in N, of an elastic sensor."""
         out = np.zeros_like(self.state.control_mm)
         for number, kind in enumerate(self.setting.body.kinds):
-            kind.add_forces(self.state.control_mm, np.zeros((0, 8, 3, 3)), out, self.state.border[1] if number else 0.0)
+            kind.add_forces(self.state.control_mm, out, self.state.border[1] if number else 0.0)
         return out
 
 

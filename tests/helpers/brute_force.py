@@ -5,7 +5,7 @@ from plain_sensor import changed, plain
 from scipy import stats
 
 from scenes.sensor import SensorSpec
-from twin.optics.lights import lights
+from twin.optics.direct_light import lights
 from twin.optics.scene import build_pinhole_camera, build_scene, mesh
 from twin.optics.surfaces import PaintedSurface
 

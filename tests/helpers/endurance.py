@@ -17,8 +17,7 @@ import psutil
 from free_ports import free_offset
 
 from hardware.arms.mg400_wire import DASHBOARD_PORT
-from hardware.servo.loop import Decided, ServoLoop
-from hardware.servo.step import LoopSettings
+from hardware.servo.loop import Decided, LoopSettings, ServoLoop
 from hardware.workcell.build import build_rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.errors import TwinError
@@ -65,7 +64,7 @@ from hardware.emulators.twin_camera import FeedbackPose
 from hardware.workcell.build import twin_camera
 from hardware.rig.geometry import PlacedObject
 from scenes import load_experiment, load_object, load_sensor, load_servo
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.types import Form
 arm, port, sensor, thing, servo, fps = sys.argv[1:]
 spec, how = load_sensor(sensor), load_servo(servo)

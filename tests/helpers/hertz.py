@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from block import build_block
 
-from twin.mechanics.balance import Body, Friction, LoadState
+from twin.mechanics.balance import Body, LoadState
 from twin.mechanics.contact import ContactPoints
+from twin.mechanics.law import ContactLaw
 from twin.mechanics.newton import LoadStepper
 from twin.objects.analytic import Sphere
 
@@ -92,11 +93,11 @@ def indent(spec, *, fine: float, size: float = SIZE, steps: int = 4) -> Indented
         penalty_mpa_mm=30.0,
         T=np.eye(4),
     )
-    stepper = LoadStepper(Body((elements,), points, ~fixed, False), [block.boxes], Sphere(SPHERE_MM), Friction(0.0, 0.0), 0.0)
+    stepper = LoadStepper(Body((elements,), points, ~fixed, False), [block.boxes], Sphere(SPHERE_MM), ContactLaw())
     for step in range(1, steps + 1):
         T = np.eye(4)
         T[2, 3] = -depth_mm * step / steps
-        state, balance, looked = stepper.step(state, T, [np.zeros((0, 8, 3, 3))])
+        state, balance, looked = stepper.step(state, T, (elements,))
     force, area = np.zeros(count), points.area_mm2
     force[looked] = balance.contact.normal_n
     at = points.positions(state.control_mm)

@@ -22,8 +22,7 @@ from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError
 from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import RefusedMoveError, SafeArm
-from hardware.servo.grip import GripperRig, GripPlan, grip, run_gripper
-from hardware.servo.grippers import OutputGripper, Ros2Gripper, open_gripper
+from hardware.servo.grip import GripperRig, GripPlan, OutputGripper, Ros2Gripper, grip, open_gripper, run_gripper
 from scenes import load_sensor
 from twin.errors import OptionError
 from twin.frames import open_recording
@@ -164,12 +163,12 @@ def test_a_gripper_behind_ros_2_gets_its_width(joints, sent_m, monkeypatch):
 
     monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")
     monkeypatch.setenv("ROS_DOMAIN_ID", str(random.randrange(1, 230)))
-    monkeypatch.setattr("hardware.servo.grippers.CONNECT_S", 0.2)
+    monkeypatch.setattr("hardware.servo.grip.CONNECT_S", 0.2)
     gripper, kind = Ros2Gripper("/hand/commands", joints), "std_msgs/Float64MultiArray"
     with pytest.raises(DeviceError, match="ROS 2 gripper at /hand/commands: nobody takes std_msgs/Float64MultiArray"):
         gripper.move(30.0)
     assert np.isnan(gripper.width_mm)
-    monkeypatch.setattr("hardware.servo.grippers.CONNECT_S", 20.0)
+    monkeypatch.setattr("hardware.servo.grip.CONNECT_S", 20.0)
     reader = Participant().reader("/hand/commands", kind)
     gripper.move(30.0)
     until_s, found = time.monotonic() + 10.0, []

@@ -25,8 +25,8 @@ from hardware.cameras.reader import DevicePicture, LiveSource
 from hardware.cameras.recorded import SessionSource
 from hardware.cameras.twin import preview_of
 from hardware.emulators.camera import CameraEmulator
+from hardware.emulators.faults import Emulator
 from hardware.emulators.mg400 import Mg400Emulator
-from hardware.emulators.running import run_until_signal
 from hardware.errors import DeviceError
 from hardware.live.live import LiveSession, Shower, WatchPlan, watch
 from hardware.rig.geometry import PlacedObject
@@ -46,8 +46,8 @@ from twin.frames.images import write_image
 from twin.pins import Pipeline
 from twin.pins.batch import voronoi_map
 from twin.records import open_records
-from twin.records.ros2_messages import decode
-from twin.rig.mounting import Mounting
+from twin.records.ros2 import decode
+from twin.rig.kinematics import Mounting
 from twin.studio.live_page import LivePage, frame_pictures
 from twin.types import Form, Frame
 
@@ -438,8 +438,10 @@ def test_pins_are_not_counted_from_a_pressed_sensor(tmp_path):
 
 
 def test_an_emulator_that_fails_ends_with_its_error():
+    device = nullcontext()
+    device.place, device.error = "a device", DeviceError("the arm is gone")
     with pytest.raises(DeviceError, match="the arm is gone"):
-        run_until_signal(nullcontext(), lambda: "a device", failure=lambda: DeviceError("the arm is gone"))
+        Emulator.run(device)
 
 
 @pytest.mark.slow

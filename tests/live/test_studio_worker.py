@@ -14,11 +14,10 @@ import pytest
 
 from twin.errors import ContactError, TwinError
 from twin.studio.contact import Light, SolvedMesh
-from twin.studio.page import PORTS_TRIED, StudioPage, free_port
+from twin.studio.page import PORTS_TRIED, StudioPage, free_port, keep_upload
 from twin.studio.pose import NAMES, ObjectPose
 from twin.studio.state import LAST_STATE, MOST_BYTES, StudioState, first_state, read_trajectory, save_trajectory, tap_and_shear
 from twin.studio.tracing import Failed, Traced
-from twin.studio.uploads import keep_upload
 from twin.studio.video import RATE_HZ, FilmWriter
 from twin.studio.worker import Newest, Worker
 
@@ -90,6 +89,16 @@ class StandTracer:
         return jobs
 
 
+class StartedWorker(Worker):
+    """Works in its context."""
+
+    def __enter__(self):
+        self.start()
+
+    def __exit__(self, *_):
+        self.stop()
+
+
 def run(contact, tracer=None):
     answers, said, news = [], [], threading.Condition()
 
@@ -102,7 +111,7 @@ def run(contact, tracer=None):
         with news:
             assert news.wait_for(lambda: any(map(wanted, answers)), WAIT_S)
 
-    return Worker(contact, tracer, heard, said.append), answers, said, wait
+    return StartedWorker(contact, tracer, heard, said.append), answers, said, wait
 
 
 def test_only_the_newest_wish_counts():

@@ -11,7 +11,7 @@ from scipy import stats
 
 from twin.camera.projection import window_tangent
 from twin.geometry.pins import rest_pins
-from twin.optics.glass.window import Window
+from twin.optics.glass import Window
 from twin.optics.render import Renderer
 from twin.optics.static_layer import ACROSS
 from twin.optics.variants.variant import use_variant

@@ -13,8 +13,8 @@ from scipy import stats
 from scenes.sensor import SensorSpec
 from twin.camera.capture import expose
 from twin.optics import static_layer, tracer
-from twin.optics.glass.window import Window
-from twin.optics.lights import Patch
+from twin.optics.direct_light import Patch
+from twin.optics.glass import Window
 from twin.optics.render import Renderer
 
 WHITE = (1.0, 1.0, 1.0)

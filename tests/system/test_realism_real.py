@@ -7,8 +7,8 @@ import pytest
 from scenes import load_sensor
 from training.data.two_sample import two_sample
 from twin.camera.projection import lens_disc
-from twin.evaluation.pictures.frames import read_real
-from twin.evaluation.pictures.statistics import TARGET, TARGET_MEASURES, compare_statistics, measure_frame
+from twin.evaluation.pictures.aligned import read_real
+from twin.evaluation.pictures.statistics import TARGET, TARGET_MEASURES, FrameStatistics, Statistics
 
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 
@@ -28,8 +28,8 @@ def real(real_dir):
 
 def test_halves_of_the_real_frames_have_the_same_caps(real):
     disc, frames = real
-    measured = [measure_frame(frame.gray, frame.pins_px, disc) for frame in frames]
-    found = compare_statistics(measured[::2], measured[1::2])
+    measured = [FrameStatistics(frame.gray, frame.pins_px, disc) for frame in frames]
+    found = Statistics(measured[::2], measured[1::2])
     worst = {measure: found.worst(measure) for measure in TARGET_MEASURES}
     print(worst, found.spectrum_db, found.scalars)
     assert max(worst.values()) < TARGET

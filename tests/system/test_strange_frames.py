@@ -6,8 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hardware.servo.loop import ServoLoop
-from hardware.servo.step import LoopSettings
+from hardware.servo.loop import LoopSettings, ServoLoop
 from hardware.workcell.build import build_rig
 from scenes import load_experiment, load_object, load_servo
 from training.estimate.estimator import PoseEstimator

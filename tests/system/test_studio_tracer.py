@@ -1,6 +1,7 @@
 """The studio's path tracer in its own process: it never locks up, traces the newest, saves contacts, and its end is told."""
 
 import time
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ def await_outcomes(tracer, enough):
 
 @pytest.fixture(scope="module")
 def tracer():
-    with Tracer(SENSOR) as made:
+    with closing(Tracer(SENSOR)) as made:
         yield made
 
 
@@ -59,7 +60,7 @@ def test_a_contact_is_saved_as_twin_render_does(tracer, tmp_path):
 
 
 def test_the_end_of_the_process_is_told_once_and_later_jobs_are_dropped():
-    with Tracer(SENSOR) as tracer:
+    with closing(Tracer(SENSOR)) as tracer:
         tracer.start()
         tracer._process.kill()
         (failed,) = await_outcomes(tracer, lambda all_: len(all_) > 0)

@@ -19,8 +19,7 @@ from training.estimate.estimator import PoseEstimator
 from training.studies.sim_to_real import SimToRealPlan
 from training.studies.sim_to_real.label_efficiency import label_efficiency
 from training.studies.sim_to_real.model_inversion import READ, read_twin
-from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL
-from training.studies.sim_to_real.steps import arm_labels
+from training.studies.sim_to_real.steps import BOTH, EVENLY, REAL, arm_labels
 from training.studies.sim_to_real.study import teach
 from twin.cli import command_line
 from twin.errors import FrameError, TwinError

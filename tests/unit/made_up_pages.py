@@ -13,7 +13,7 @@ from training.data.pins import PinTable
 from training.data.targets import PRESETS
 from training.studies.label_audit import summary_of, write_audit
 from training.studies.objects import ObjectsPlan, verdicts
-from training.studies.tac_vgnn import page as study_report
+from training.studies.tac_vgnn import study as study_report
 from training.studies.tac_vgnn.models import plan_run
 from training.studies.tac_vgnn.study import AreaChange, contacts_figure
 from twin.calibration.contact.report import write_calibration
@@ -23,11 +23,10 @@ from twin.demo.make_demo import ContactResult, DepthRow, add_contact, add_motion
 from twin.demo.make_demo import write_page as write_demo_page
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.evaluation.pictures import report as realism
+from twin.evaluation.pictures.aligned import RealFrame
 from twin.evaluation.pictures.compare import Pair
-from twin.evaluation.pictures.frames import RealFrame
 from twin.evaluation.pictures.images import ImageFigures
-from twin.evaluation.pictures.spectra import RadialRow
-from twin.evaluation.pictures.statistics import RADIAL_MEASURES
+from twin.evaluation.pictures.statistics import RADIAL_MEASURES, RadialRow
 from twin.mechanics.path import ContactPose
 from twin.pins import make_graph, nominal_reference
 from twin.report.charts import new_figure, write_chart
@@ -55,7 +54,7 @@ def pins():
 
 
 def sim_to_real(out: Path) -> Path:
-    from training.studies.sim_to_real.page import write_page
+    from training.studies.sim_to_real.study import write_page
 
     told = [("simulated", 0, "vgnn", 0.066), ("simulated and real", 40, "vgnn", 0.053), ("simulated, bare", 0, "vgnn", 0.12)]
     told += [("real", n, model, e) for n, e in ((40, 0.2), (3010, 0.021)) for model in ("vgnn", "quadratic regression")]
@@ -83,7 +82,7 @@ def sim_to_real(out: Path) -> Path:
 
 
 def across_objects(out: Path) -> Path:
-    from training.studies.objects.study import write_page
+    from training.studies.objects import write_page
 
     experiment = load_experiment("objects-2d")
     train, unseen = (load_object("plane"), load_object("sphere")), (load_object("edge"),)
@@ -119,11 +118,12 @@ def study(out: Path) -> Path:
     write_chart(out / "efficiency.png", lambda: study_report.efficiency_figure(efficiency))
     write_chart(out / "contacts.png", lambda: contacts_figure(contacts))
     figures = [contact.figures() for contact in contacts]
-    for name, rows in (("models", models), ("graphs", graphs), ("efficiency", efficiency), ("contacts", figures)):
+    tables = {"models": models, "graphs": graphs, "efficiency": efficiency, "contacts": figures}
+    for name, rows in tables.items():
         write_table(out / f"{name}.csv", rows)
     columns = ["model", "seed", "state", "epochs", "leak_slope", *(f"{label}_{kind}" for kind in ("raw", "corrected") for label in LABELS)]
     notes = {"columns": columns, "labels": "raw", "max_minutes": 30, "device": "cpu", "threads": 2}
-    return study_report.write_page(out, data=data, models=models, graphs=graphs, efficiency=efficiency, contacts=figures, notes=notes)
+    return study_report.write_page(out, data, tables, notes)
 
 
 def contact_calibration(out: Path) -> Path:

@@ -11,8 +11,7 @@ from scenes import RandomisationSpec, load_object
 from training.data.dataset import join_datasets, split_rows, with_common_labels
 from training.errors import TrainingError
 from training.runs.run import fold_rows
-from training.studies.objects import ObjectsPlan, rows_in_range, verdicts
-from training.studies.objects.study import MIXED
+from training.studies.objects import MIXED, ObjectsPlan, rows_in_range, verdicts
 from twin.errors import FrameError
 from twin.pins import make_reference
 from twin.types import Form

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from hardware.errors import DeviceError
-from hardware.rig.approach import path_around
-from hardware.rig.geometry import PlacedObject, shift_in_tool
+from hardware.rig.geometry import PlacedObject, path_around, shift_in_tool
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.rig.arm_pose import matrix_of
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 
 SAMPLES = 200  # along each straight piece
 

@@ -26,6 +26,6 @@ def test_a_modulus_moves_less_than_a_length(costs):
 
 def test_the_table_adds_no_cost_of_its_own(monkeypatch):
     """A number that is not changed costs nothing."""
-    monkeypatch.setattr(assumptions, "_changes", lambda spec: {("nothing", "+0 %"): (spec, "")})
+    monkeypatch.setattr(assumptions, "_changes", lambda spec: {("nothing", "+0 %"): (spec, False)})
     (found,) = cost_of_assumptions(load_sensor("mg400-127"))
     assert found.depth_share == found.tilt_deg == 0.0

@@ -238,7 +238,7 @@ def luma(frame: np.ndarray) -> np.ndarray:
 
 def test_lost_chroma_leaves_the_luma_as_it_is():
     light, soft = picture(), changed(PLAIN, response={"chroma_sigma_px": 2.0, "chroma_columns": 2}).response
-    lost = developed(light, light, soft)
+    lost = developed(light, light, soft, soft.chroma_columns, (0, 0))
     assert np.abs(luma(lost) - luma(255 * light)).max() < 5e-5 and np.abs(lost - 255 * light).max() > 58
 
 
@@ -247,7 +247,7 @@ def test_soft_colour_of_an_edge_stays_at_the_edge():
     light = np.full((40, 80, 3), 0.01, np.float32)
     light[:, 40:] = (0.2, 0.3, 0.6)
     soft = changed(CURVED, response={"chroma_sigma_px": 2.0}).response
-    gray = developed(light, light, soft)
+    gray = developed(light, light, soft, 1, (0, 0))
     row = (gray[20, :, 2] - luma(gray[20]))[30:50]
     half = np.interp((row[0] + row[-1]) / 2, row, np.arange(30.0, 50.0))
     edge = 39.5
@@ -259,9 +259,10 @@ def test_soft_colour_of_an_edge_stays_at_the_edge():
 def test_a_median_of_colour_flattens_specks_and_keeps_edges_and_luma():
     light = np.full((40, 80, 3), 0.01, np.float32)
     light[:, 40:] = (0.2, 0.3, 0.6)
-    edge = developed(light, light, CURVED.response)
+    edge = developed(light, light, CURVED.response, 1, (0, 0))
     light[4::10, 4::10, 2] += 0.1  # single pixels
-    plain, clean = (developed(light, light, changed(CURVED, response={"chroma_median_px": side}).response) for side in (0, 5))
+    medians = [changed(CURVED, response={"chroma_median_px": side}).response for side in (0, 5)]
+    plain, clean = (developed(light, light, median, 1, (0, 0)) for median in medians)
     rounding = 1e-3
     np.testing.assert_allclose(luma(clean), luma(plain), atol=rounding)
     np.testing.assert_allclose(clean - luma(clean)[..., None], edge - luma(edge)[..., None], atol=rounding)

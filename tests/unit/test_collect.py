@@ -18,7 +18,7 @@ from scenes import PlacementSpec, load_experiment, load_object, load_sensor
 from training.data.design import nearest_to_even
 from twin.frames import open_recording, read_image
 from twin.rig.arm_pose import matrix_of
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.types import Form, Frame
 
 LATE_S = 0.15  # of the late camera: a frame arrives so long after its exposure

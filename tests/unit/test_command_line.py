@@ -321,7 +321,7 @@ def test_ctrl_c_is_one_line(monkeypatch):
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("scenes.catalog.list_all", interrupted)
+    monkeypatch.setattr("scenes.load.catalog_lines", interrupted)
     ended = run_twin("sensors")
     assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "twin: interrupted\n")
 
@@ -380,7 +380,7 @@ def test_a_letter_that_the_terminal_lacks_is_printed_by_its_number(monkeypatch):
     written = io.BytesIO()
     monkeypatch.setattr("sys.stdout", io.TextIOWrapper(written, encoding="ascii"))
     monkeypatch.setattr("sys.argv", ["twin", "sensors"])
-    monkeypatch.setattr("scenes.catalog.Catalog.lines", lambda _: ["f_\xe4.png", "f_\udcc3\udca4.png"])
+    monkeypatch.setattr("scenes.load.catalog_lines", lambda _: ["f_\xe4.png", "f_\udcc3\udca4.png"])
     with pytest.raises(SystemExit) as end:
         main()
     assert end.value.code == 0 and written.getvalue() == b"f_\\xe4.png\nf_\\udcc3\\udca4.png\n"
@@ -392,7 +392,7 @@ def test_a_missing_device_is_one_line_though_it_is_also_an_error_of_the_system(m
     def absent(*_: object) -> None:
         raise DeviceNotConnectedError("MG400 at 127.0.0.1: no connection; check that the arm is on")
 
-    monkeypatch.setattr("scenes.catalog.list_all", absent)
+    monkeypatch.setattr("scenes.load.catalog_lines", absent)
     monkeypatch.setattr("sys.argv", ["twin", "sensors"])
     with pytest.raises(SystemExit) as end:
         main()

@@ -12,7 +12,7 @@ from scenes.sensor import AppearanceSpec, BlobSpec, CameraSpec, PipelineSpec, Se
 from twin.calibration.new_sensor import DARK_CAPS, new_sensor
 from twin.camera.capture import expose
 from twin.errors import FrameError
-from twin.evaluation.degradation.conditions.skin import faded, missing, pale
+from twin.evaluation.degradation.conditions.body import faded, missing, pale
 from twin.frames.forms import is_two_level
 from twin.optics.preview import Preview
 from twin.optics.surfaces import cap_albedo

@@ -6,13 +6,11 @@ from block import rotation
 from scipy.spatial import cKDTree
 
 from scenes.body import SkinSpec
-from scenes.load import list_sensors, load_sensor
-from twin.geometry.bspline import Basis
-from twin.geometry.chart import Chart, Focus, square_of_disc
+from scenes.load import list_specifications, load_sensor
 from twin.geometry.mesh import GEL, SKIN, NodeView, build_mesh, skin_surface, to_pyvista
 from twin.geometry.pins import rest_pins
-from twin.geometry.shapes import RectangularPad, shape_of
-from twin.geometry.solid import Resolution, body_points, build_solid, pin_pose, rotations, surface_operators
+from twin.geometry.shapes import Chart, Focus, RectangularPad, shape_of, square_of_disc
+from twin.geometry.solid import Basis, Resolution, body_points, build_solid, pin_pose, rotations, surface_operators
 
 ROUNDING_MM = 1e-9
 SPLINE_MM = 0.075  # how far a spline surface of 16 elements across lies from its sphere of 20 mm (measured 0.069)
@@ -311,7 +309,7 @@ def test_a_solid_too_coarse_or_odd_is_refused():
 # --- pins
 
 
-@pytest.mark.parametrize("name", list_sensors())
+@pytest.mark.parametrize("name", list_specifications("sensors"))
 @pytest.mark.parametrize("focus", [Focus(), Focus(0.9, 2.0, turn_rad=1.0)])
 def test_pins_at_rest_are_the_specification_s(name, focus):
     spec = load_sensor(name)
@@ -376,7 +374,7 @@ def test_nodes_rest_exactly_and_follow_an_affine_motion(sensor, mesh, gel_layers
     off = []
     for across in (16, 32):
         solid = build_solid(sensor.geometry, resolution=Resolution(across, skin_layers, gel_layers), focus=Focus(0.4, 1.0))
-        view = NodeView.of(mesh, solid)
+        view = NodeView(mesh, solid)
         assert np.array_equal(view.nodes(solid.control_mm), mesh.nodes_mm)
         assert np.abs(view.nodes(solid.control_mm + shift) - (mesh.nodes_mm + shift)).max() < ROUNDING_MM
         moved = view.nodes(solid.control_mm + solid.control_mm @ slope.T) - (mesh.nodes_mm + mesh.nodes_mm @ slope.T)
@@ -386,7 +384,7 @@ def test_nodes_rest_exactly_and_follow_an_affine_motion(sensor, mesh, gel_layers
 
 
 def test_nodes_in_the_rim_on_the_wall_and_on_the_lens_never_move(sensor, mesh, solid):
-    view = NodeView.of(mesh, solid)
+    view = NodeView(mesh, solid)
     moved = solid.control_mm + np.where(solid.fixed, 0, 1)[:, None] * np.random.default_rng(0).normal(size=solid.control_mm.shape)
     motion = np.linalg.norm(view.nodes(moved) - mesh.nodes_mm, axis=1).reshape(mesh.grid)
     assert motion[-1].max() == 0

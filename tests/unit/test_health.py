@@ -43,7 +43,8 @@ PLACE = ("shift", "turn", "scale", "stretch", "mirror")
 
 def test_an_undamaged_sensor_has_no_bad_finding():
     found = verdicts(frames("noise", 0.0))
-    assert {f.verdict for f in found.values()} == {Grade.HEALTHY}, found
+    assert {f.verdict for f in found.values() if f.name != "mirror"} == {Grade.HEALTHY}, found
+    assert found["mirror"].verdict is Grade.UNSURE and found["mirror"].remedy, "pins at rest alone do not show a mirror"
     assert set(found) == {"brightness", "saturation", "focus", "glare", "stray light", "layout", "pins", "specks", *PLACE}
 
 

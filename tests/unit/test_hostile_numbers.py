@@ -13,8 +13,8 @@ from noisy_camera import NoisyCamera
 from hardware.cameras.choose import open_camera
 from hardware.collect.collect import CollectPlan
 from hardware.emulators.camera import CameraEmulator
+from hardware.emulators.magician import MagicianEmulator
 from hardware.emulators.mg400 import Mg400Emulator
-from hardware.emulators.running import emulate_magician, emulate_mg400
 from hardware.emulators.twin_camera import emulate_camera
 from hardware.errors import DeviceError
 from hardware.live.studio_mode import require_feed
@@ -42,9 +42,9 @@ SENSOR = (SHIPPED / "sensors" / "mg400-127.toml").read_text()
 @pytest.mark.parametrize("number", [float("inf"), float("nan"), 0.0, -1.0, 1e9])
 def test_rates_that_are_none_are_refused_with_their_range(number):
     with pytest.raises(DeviceError, match="`time_scale` .*: expected 0.001 to 1000"):
-        emulate_mg400(time_scale=number)
+        Mg400Emulator(time_scale=number)
     with pytest.raises(DeviceError, match="`time_scale` .*: expected 0.001 to 1000"):
-        emulate_magician(time_scale=number)
+        MagicianEmulator(time_scale=number)
     with pytest.raises(DeviceError, match="`rate` .*: expected 0.1 to 1000 decisions a second"):
         FollowPlan(load_object("can"), load_servo("surface"), stream_hz=number)
 

@@ -10,9 +10,8 @@ from twin.errors import ContactError
 from twin.objects import build_field
 from twin.objects.analytic import Plane
 from twin.rig.contact import contact_law
-from twin.rig.kinematics import TURNING, arm_path, object_pose, rig_of
+from twin.rig.kinematics import TURNING, Mounting, arm_path, object_pose, rig_of
 from twin.rig.labels import ArmLabel
-from twin.rig.mounting import Mounting
 
 EXACT_MM = 1e-9
 TOUCH_MM = 3e-3  # the dome is sampled
@@ -151,7 +150,7 @@ def test_an_arm_that_turns_under_a_force_is_where_a_larger_angle_would_have_sent
     pose[TURNING[approach]] = 12.0
     further[TURNING[approach]] = 12.0 + 0.6
     sent = object_pose(rig, plan, pose, 20.0)
-    mounting, plane = Mounting.on(rig, plan, SkinSpec()), load_object("plane")
+    mounting, plane = Mounting(rig, plan, SkinSpec()), load_object("plane")
     assert contact_law(rig, mounting, plane).given_way is None
     turning = contact_law(rig.model_copy(update={"turn_compliance_deg_per_n": 0.3}), mounting, plane).pose
     across, aside = mounting.across_in_sensor, np.cross([0.0, 0.0, 1.0], mounting.across_in_sensor)

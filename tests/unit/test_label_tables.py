@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from scenes import list_experiments, load_experiment
+from scenes import list_specifications, load_experiment
 from twin.frames.tables import numbers, order_by_table, unlikely_units
 
 MANY = settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -145,7 +145,7 @@ def test_a_number_with_an_underscore_is_a_slip_of_the_hand_and_no_number(tmp_pat
     assert np.isnan(found["f_0.png"]["pose_2"]) and found["f_0.png"]["pose_6"] == 2.5
 
 
-EXPERIMENTS = [load_experiment(name) for name in list_experiments()]
+EXPERIMENTS = [load_experiment(name) for name in list_specifications("experiments")]
 
 
 def in_units(length, angle, ranges):

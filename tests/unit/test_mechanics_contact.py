@@ -68,7 +68,7 @@ def test_contact_stiffness_is_minus_the_derivative_of_its_forces(name, friction,
     stiff, mu = generator.uniform(1, 5, count), np.full(count, friction)
 
     def forces(places):
-        return contact_forces(field, places, stiff, anchor, mu, bound_n=np.full(count, bound_n), soften=soften)
+        return contact_forces(field, places, stiff, anchor, mu, np.full(count, bound_n), soften)
 
     now, step = forces(at), 1e-7
     pressing = now.penetration_mm > 0
@@ -84,8 +84,8 @@ def test_point_forces_are_normal_plus_friction_in_the_cone_and_slip_is_on_it():
     field, generator = build_field(load_object("sphere")), np.random.default_rng(5)
     at = np.column_stack([generator.normal(scale=1, size=(300, 2)), np.full(300, 0.2)])
     anchor, mu = at + generator.normal(scale=0.01, size=at.shape), generator.uniform(0, 1, 300)
-    found = contact_forces(field, at, np.full(300, 2.0), anchor, mu)
-    bounded = contact_forces(field, at, np.full(300, 2.0), anchor, mu, bound_n=np.full(300, 0.1))
+    found = contact_forces(field, at, np.full(300, 2.0), anchor, mu, np.full(300, np.inf))
+    bounded = contact_forces(field, at, np.full(300, 2.0), anchor, mu, np.full(300, 0.1))
     tangential = found.force_n - found.normal_n[:, None] * found.normal
     size = np.linalg.norm(tangential, axis=1)
     assert np.abs(np.einsum("pi,pi->p", tangential, found.normal)).max() < 1e-12

@@ -12,9 +12,8 @@ from hardware.arms.dobot_alarms import ALARMS, explain
 from hardware.arms.mg400_wire import PACKET_BYTES, TEST_VALUE, Mode, newest_packet, take_reply, why_refused
 from hardware.emulators.faults import Faults
 from hardware.emulators.mg400 import FAULTS, feedback_packet
-from hardware.emulators.mg400_commands import Mg400Commands
-from hardware.emulators.mg400_controller import Mg400Controller, PlanarFrame
-from hardware.emulators.mg400_grammar import LONGEST_REQUEST, RefusedError, take_request
+from hardware.emulators.mg400_commands import LONGEST_REQUEST, Mg400Commands, take_request
+from hardware.emulators.mg400_controller import Mg400Controller, PlanarFrame, RefusedError
 
 
 def commands(firmware=(1, 7, 0), faults=(), enabled=True):

@@ -7,11 +7,12 @@ import pytest
 import torch
 
 from training.models import MODELS
-from training.models.graphs.model import CHANNELS, Gcn, frame_edges, graph_rows
+from training.models.graphs.model import CHANNELS, Gcn, block_diagonal, graph_rows
 from training.models.vgnn.model import Vgnn, VgnnSize, mode_components
 from training.models.vgnn.registration import fit_registration
 from training.runs.assemble import conformal_quantile, group_quantiles
 from training.runs.loop import row_loss
+from twin.pins import make_graph
 
 PINS, FRAMES = 40, 6
 
@@ -20,7 +21,7 @@ PINS, FRAMES = 40, 6
 def layout():
     rng = np.random.default_rng(0)
     rest = rng.uniform(0, 10, (PINS, 2))
-    return rest, frame_edges("delaunay", rest)
+    return rest, make_graph("delaunay", rest).edges
 
 
 def pin_rows(seed=1, frames=FRAMES):
@@ -63,8 +64,8 @@ def test_gcn_does_not_know_the_order_of_pins(layout, kind):
     x = pin_rows(frames=1)
 
     def said(x, nodes):
-        edges = [frame_edges(kind, nodes)]
-        matrices = [graph_rows(edges, PINS, transposed=t).batch(np.array([0])) for t in (False, True)]
+        edges = [make_graph(kind, nodes).edges]
+        matrices = [block_diagonal(graph_rows(edges, PINS, transposed=t), np.array([0])) for t in (False, True)]
         return network(x, *matrices)["mean"]
 
     assert torch.allclose(said(x, rest), said(x[:, order], rest[order]), atol=1e-5)
@@ -72,13 +73,13 @@ def test_gcn_does_not_know_the_order_of_pins(layout, kind):
 
 def test_a_batch_of_graphs_says_what_each_says_alone(layout):
     rng = np.random.default_rng(4)
-    edges = [frame_edges("knn", rng.uniform(size=(PINS, 2))) for _ in range(4)]
+    edges = [make_graph("knn", rng.uniform(size=(PINS, 2))).edges for _ in range(4)]
     forward, back = graph_rows(edges, PINS), graph_rows(edges, PINS, transposed=True)
     torch.manual_seed(0)
     network, x = Gcn(2, 2).eval(), pin_rows(frames=4)[..., :2]
     rows = np.array([2, 0, 3])
-    together = network(x[rows], forward.batch(rows), back.batch(rows))["mean"]
-    alone = [network(x[k : k + 1], forward.batch(np.array([k])), back.batch(np.array([k])))["mean"] for k in rows]
+    together = network(x[rows], block_diagonal(forward, rows), block_diagonal(back, rows))["mean"]
+    alone = [network(x[k : k + 1], *(block_diagonal(rows_of, np.array([k])) for rows_of in (forward, back)))["mean"] for k in rows]
     assert torch.allclose(together, torch.cat(alone), atol=1e-5)
 
 
@@ -86,9 +87,9 @@ def test_a_convolution_with_its_norm_is_kipf_and_wellings_with_torchs_norm(layou
     """Values, gradients and running statistics are those of the dense formula, with the bias that the norm cancels."""
     rest, edges = layout
     for kind in ("delaunay", "knn"):  # symmetric, and not
-        edges = frame_edges(kind, rest)
+        edges = make_graph(kind, rest).edges
         rows = np.array([0, 0])
-        matrices = [graph_rows([edges], PINS, transposed=t).batch(rows) for t in (False, True)]
+        matrices = [block_diagonal(graph_rows([edges], PINS, transposed=t), rows) for t in (False, True)]
         torch.manual_seed(0)
         network = Gcn(3, 2)
         for norm in network.norms:

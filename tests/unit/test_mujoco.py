@@ -16,15 +16,14 @@ from scenes import PlacementSpec, load_experiment, load_object, load_sensor
 from scenes.write import sensor_files
 from training.mujoco import TactileScene
 from training.mujoco.carried import CARRIED, open_world
-from training.mujoco.geoms import FILLET_MM, solid_of
-from training.mujoco.grasp import BONUS, CRUSH, FRICTION, MASS_KG, WANTED
-from training.mujoco.model import attach_sensor, load_scene, sensor_part, write_urdf
+from training.mujoco.model import FILLET_MM, attach_sensor, load_scene, sensor_part, solid_of, write_urdf
+from training.mujoco.task import BONUS, CRUSH, FRICTION, MASS_KG, WANTED
 from training.surrogate.model import SurrogateError, mechanics_of, surrogate_of
 from training.surrogate.solids import Drum, Ellipsoid, SweptBox, distances_to
 from twin.errors import ContactError, OptionError
 from twin.geometry.pins import rest_pins
 from twin.mechanics.path import ContactPose
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.simulator import Simulator
 from twin.types import Form
 

@@ -5,7 +5,7 @@ import pytest
 from plain_sensor import changed, plain
 
 from twin.calibration.light.response import apparent_mm, defocus_px
-from twin.optics.defocus import circles_px, defocused
+from twin.optics.preview import circles_px, defocused
 
 
 def test_on_the_axis_a_circle_is_that_of_the_apparent_distance():

@@ -8,16 +8,22 @@ from scenes.sensor import SensorSpec
 from twin.camera.projection import pixel_rays, project
 from twin.errors import RenderError
 from twin.geometry.pins import PinRest, rest_pins
-from twin.optics.direct_light import DirectLight
-from twin.optics.lights import lights
+from twin.optics.direct_light import DirectLight, lights
 from twin.optics.preview import Preview, Shading
 
 NOTHING = (0.0, 0.0)  # no light from elsewhere, nothing covered
 
 
-def evenly(points_mm, normals):
+class EvenLight(DirectLight):
     """Light that is the same everywhere."""
-    return np.ones((len(points_mm), 3))
+
+    def __call__(self, points_mm, normals, bump=0.0):
+        return np.ones(normals.shape)
+
+
+@pytest.fixture
+def evenly(monkeypatch):
+    monkeypatch.setattr("twin.optics.preview.DirectLight", EvenLight)
 
 
 @pytest.fixture(scope="module")
@@ -106,8 +112,8 @@ def test_a_way_to_the_camera_is_the_ray_of_the_pixel(small):
     np.testing.assert_allclose(rest.caps_mm + length[:, None] * toward, entry, atol=rounding)
 
 
-def test_the_centroid_of_a_cap_is_that_of_its_projected_disc(small):
-    image, errors = Preview(small, light=evenly, static=NOTHING).render(), []
+def test_the_centroid_of_a_cap_is_that_of_its_projected_disc(small, evenly):
+    image, errors = Preview(small, static=NOTHING).render(), []
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     for disc in projected_discs(small):
         _, centroid = area_and_centroid(disc)
@@ -117,19 +123,17 @@ def test_the_centroid_of_a_cap_is_that_of_its_projected_disc(small):
     assert np.sqrt(np.square(errors).sum(axis=1).mean()) < tolerance_px
 
 
-def test_caps_cover_their_projected_area(small):
+def test_caps_cover_their_projected_area(small, evenly):
     clear = changed(small, lens={"refractive_index": 1.0}, gel={"refractive_index": 1.0})  # the window takes no light
-    covered = Preview(clear, light=evenly, static=NOTHING).render().sum() / (0.8 / np.pi)
+    covered = Preview(clear, static=NOTHING).render().sum() / (0.8 / np.pi)
     share = 0.009  # measured: 0.0081, because caps overlap
     assert covered == pytest.approx(sum(area_and_centroid(disc)[0] for disc in projected_discs(clear)), rel=share)
 
 
-def test_caps_with_measured_outlines_have_their_shape(small):
+def test_caps_with_measured_outlines_have_their_shape(small, evenly):
     """``1 + a cos 2t`` has (1 + a^2 / 2) of the circle's area and is longest along x."""
     clear = changed(small, lens={"refractive_index": 1.0}, gel={"refractive_index": 1.0})
-    round_, oval = (
-        Preview(changed(clear, appearance={"cap_shapes": s}), light=evenly, static=NOTHING).render() for s in ((), ((0.0, 0.2, 0.0),) * 19)
-    )
+    round_, oval = (Preview(changed(clear, appearance={"cap_shapes": s}), static=NOTHING).render() for s in ((), ((0.0, 0.2, 0.0),) * 19))
     assert oval.sum() / round_.sum() == pytest.approx(1 + 0.2**2 / 2, rel=0.0062)
     u, v = np.rint(project(clear.view, rest_pins(clear.geometry).caps_mm[0])).astype(int)
     wider, lower = (oval - round_)[v, u - 9 : u + 10].sum(), (oval - round_)[v - 9 : v + 10, u].sum()
@@ -204,12 +208,12 @@ def test_the_static_layer_covers_the_gel(small):
 
 
 @pytest.mark.parametrize(("towards_mm", "seen"), [(-3.0, 0.5), (3.0, 1.0)])
-def test_a_nearer_cap_hides_a_farther_one(small, towards_mm, seen):
+def test_a_nearer_cap_hides_a_farther_one(small, evenly, towards_mm, seen):
     """Pin 1 (level 0.5) is put before, then behind pin 0 (level 1)."""
     levels = (1.0, 0.5, *[1.0] * 17)
     rest = rest_pins(small.geometry)
     state = moved(rest, 1, rest.caps_mm[0] - rest.caps_mm[1] + [0.0, 0.0, towards_mm])
-    image = Preview(changed(small, appearance={"cap_levels": levels}), light=evenly, static=NOTHING).render(state)
+    image = Preview(changed(small, appearance={"cap_levels": levels}), static=NOTHING).render(state)
     u, v = np.rint(project(small.view, rest.caps_mm[0])).astype(int)
     window_takes = 0.043
     assert image[v, u] == pytest.approx(seen * 0.8 / np.pi, rel=window_takes)

@@ -20,7 +20,7 @@ def drawn(shape, polygons, light=None, side=None) -> np.ndarray:
     face, edge = (polygons, polygons) if side is None else (middle + share * (polygons - middle) for share in (0.6, 0.8))
     outlines = np.stack([np.repeat(middle, polygons.shape[1], axis=1), polygons, edge, face], axis=1)
     sides = np.zeros((count, 2 * polygons.shape[1], shape[2])) + (0.0 if side is None else side)
-    draw_pins(image, outlines, light, sides, light, np.ones(count, bool), np.arange(count))
+    draw_pins(image, outlines, (light, sides, light), np.ones(count, bool), np.arange(count))
     return image
 
 
@@ -71,7 +71,7 @@ def test_a_cap_seen_from_behind_hides_what_is_below_it():
     polygon = ring_of(6, np.random.default_rng(5))[None]
     image, light, black = np.ones((30, 40, 1)), np.ones((1, 1)), np.zeros((1, 12, 1))
     outlines = np.stack([np.repeat(polygon.mean(axis=1, keepdims=True), 6, axis=1), polygon, polygon, polygon], axis=1)
-    draw_pins(image, outlines, light, black, light, np.zeros(1, bool), np.zeros(1, int))
+    draw_pins(image, outlines, (light, black, light), np.zeros(1, bool), np.zeros(1, int))
     np.testing.assert_allclose(image, 1 - drawn((30, 40, 1), polygon), atol=1e-12)
 
 

@@ -13,10 +13,9 @@ from twin.errors import FrameError, RenderError
 from twin.evaluation.pictures.aligned import Aligned
 from twin.geometry.pins import rest_pins
 from twin.mechanics.skin_fit import FittedPins
-from twin.optics.measured import picture_of, values_of
 from twin.optics.preview import Preview
 from twin.optics.relief import DETAILS, POWER, SKIN_FROM, CapLamp, Relief, cap_places, cap_planes, tiles_of, tiles_picture, without
-from twin.optics.static_layer import BACKGROUND_POWER, static_layer
+from twin.optics.static_layer import BACKGROUND_POWER, picture_of, static_layer, values_of
 
 WINDOW = (0, 0, 320, 240)
 CODED = 0.02  # error of a value in a picture, of its span: two levels near the span's end

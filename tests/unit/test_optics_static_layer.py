@@ -6,8 +6,8 @@ from plain_sensor import changed, plain
 
 from scenes.sensor import RimSpec, SensorSpec, SpeckSpec
 from twin.camera.projection import project
-from twin.optics.glass.lens import ray_table
-from twin.optics.lights import led_patches
+from twin.optics.direct_light import led_patches
+from twin.optics.glass import ray_table
 from twin.optics.static_layer import ACROSS, static_layer
 
 WINDOW = (50, 20, 255, 225)

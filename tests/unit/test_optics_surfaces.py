@@ -7,7 +7,7 @@ from scipy.spatial import ConvexHull
 from scenes import load_sensor
 from twin.camera.projection import distort
 from twin.geometry.pins import rest_pins
-from twin.optics.glass.lens import WIDEST_FISHEYE, ray_table, valid_radius
+from twin.optics.glass import WIDEST_FISHEYE, ray_table, valid_radius
 from twin.optics.surfaces import SkinSurface, caps, stems, vertex_normals
 
 

@@ -72,7 +72,7 @@ def test_one_process_renders_with_one_backend_after_the_other():
 def test_an_llvm_that_aborts_is_refused_and_another_way_is_found(tmp_path):
     """The probe, not the file name, decides about a library the user names."""
     path = old_llvm()
-    code = "import json; from twin.optics.variants.variant import find_llvm; c = find_llvm(()).candidates[0]; "
+    code = "import json; from twin.optics.variants.variant import find_llvm; c = find_llvm(())[1][0]; "
     code += "print(json.dumps([c.ok, c.reason]))"
     ok, reason = json.loads(in_child(code, DRJIT_LIBLLVM_PATH=str(path), TACTIP_CACHE=str(tmp_path)))
     assert not ok and "signal" in reason
@@ -109,9 +109,9 @@ def test_newest_library_is_tried_first_and_old_ones_without_a_probe(tmp_path, mo
 
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     monkeypatch.setattr(variant, "probe", refuse)
-    found = variant.find_llvm(paths)
+    found, rejected = variant.find_llvm(paths)
     assert probed == ["libLLVM.so.19.1", "libLLVM-17.so.1"]
-    assert found.library is None and len(found.candidates) == 3 and "abort" in found.candidates[2].reason
+    assert found is None and len(rejected) == 3 and "abort" in rejected[2].reason
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 
 from scenes import load_sensor
-from twin.optics.glass.window import Window
+from twin.optics.glass import Window
 from twin.optics.sampling import PixelSamples
 from twin.optics.variants.variant import choose_variant, use_variant
 
@@ -28,7 +28,7 @@ def jit():
 
 @pytest.fixture(scope="module")
 def window() -> Window:
-    return Window.of(load_sensor("mg400-331").view)
+    return Window(load_sensor("mg400-331").view)
 
 
 def gel_points(count: int = 300) -> np.ndarray:

@@ -21,7 +21,7 @@ from twin.cli import command_line
 from twin.errors import FrameError, OptionError
 from twin.geometry.pins import rest_pins
 from twin.policy import Policy, PolicyError, PolicyModel, flatten, load_policy
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.types import Form, Frame
 
 SHIPPED = Path(__file__).parents[2] / "training" / "policies" / "SurfaceFollow-mg400-331.safetensors"

@@ -8,7 +8,7 @@ from drawn_frames import drawn_frame
 from scenes import load_sensor
 from twin.camera.projection import lens_disc
 from twin.errors import FrameError
-from twin.evaluation.pictures.frames import FEW_LOST, read_real
+from twin.evaluation.pictures.aligned import FEW_LOST, read_real
 from twin.pins import nominal_reference
 from twin.types import Form
 

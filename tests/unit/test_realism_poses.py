@@ -5,9 +5,8 @@ import pytest
 
 from scenes import RigSpec, load_experiment, load_sensor
 from twin.errors import FrameError
-from twin.evaluation.pictures.poses import (
+from twin.evaluation.pictures.compare import (
     EXPERIMENT,
-    PlateTaps,
     TapBank,
     bank_labels,
     contacts_of,
@@ -15,6 +14,7 @@ from twin.evaluation.pictures.poses import (
     halves,
     label_columns,
     labels_of_rows,
+    plate_taps,
 )
 from twin.geometry.solid import Resolution
 from twin.mechanics.solver import SkinSolver
@@ -103,9 +103,9 @@ def test_the_bank_covers_labels_of_a_wrong_rig():
 
 
 def test_a_label_is_pressed_along_its_normal_to_its_depth():
-    taps = PlateTaps(SkinSolver(load_sensor("ur5-331"), resolution=Resolution(12)), SURFACE)
-    rig = TRUE.model_copy(update={"compliance_mm_per_n": 0.0})
-    (indent, x, y), state = contacts_of(rig, SURFACE, [label(2.0, 6.0, -4.0)], RADIUS_MM)[0], taps.contact(rig).end(label(2.0, 6.0, -4.0))
+    solver = SkinSolver(load_sensor("ur5-331"), resolution=Resolution(12))
+    rig, pressed = TRUE.model_copy(update={"compliance_mm_per_n": 0.0}), label(2.0, 6.0, -4.0)
+    (indent, x, y), state = contacts_of(rig, SURFACE, [pressed], RADIUS_MM)[0], plate_taps(solver, SURFACE, rig).end(pressed)
     normal = np.array([x, y, np.sqrt(1 - x * x - y * y)])
     np.testing.assert_allclose(RADIUS_MM - state.contact_mm @ normal, indent, atol=PENETRATION_MM)
     middle = state.contact_mm.mean(axis=0)

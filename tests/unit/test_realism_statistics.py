@@ -8,8 +8,17 @@ from scenes import load_sensor
 from twin.camera.projection import lens_disc, round_disc
 from twin.errors import FrameError
 from twin.evaluation.pictures.images import compare_images
-from twin.evaluation.pictures.spectra import bin_of, equal_count_edges, log_distance_db, noise_sd, radial_rows, radial_spectrum
-from twin.evaluation.pictures.spots import find_spots, pair_spots, steady_spots
+from twin.evaluation.pictures.statistics import (
+    bin_of,
+    equal_count_edges,
+    find_spots,
+    log_distance_db,
+    noise_sd,
+    pair_spots,
+    radial_rows,
+    radial_spectrum,
+    steady_spots,
+)
 
 SIZE = (320, 240)
 

@@ -14,7 +14,7 @@ from twin.frames.images import write_image
 from twin.pins import nominal_reference
 from twin.records import FORMATS, KeptAlso, RecordError, convert, open_records, with_pins
 from twin.records.session import SessionWriter
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.store import contents
 from twin.types import Form, Frame
 

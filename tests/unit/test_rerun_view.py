@@ -11,10 +11,10 @@ import pytest
 from drawn_frames import drawn_frame
 
 from hardware.errors import DeviceError
-from hardware.live.rerun_view import RerunView
+from hardware.live.live import RerunView
 from scenes import load_sensor
 from training.estimate.estimator import PoseEstimate
-from twin.errors import OptionError
+from twin.errors import ExtraError, OptionError
 from twin.pins import Pipeline
 from twin.studio.live_page import LiveFrame
 from twin.types import Form
@@ -22,7 +22,7 @@ from twin.types import Form
 
 def test_without_the_package_the_remedy_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(DeviceError, match="pip install"):
+    with pytest.raises(ExtraError, match="pip install"):
         RerunView("title", "viewer")
 
 

@@ -59,7 +59,7 @@ def test_the_frame_is_changed_as_the_taught_network_says(network, residual):
 def test_outside_the_disc_only_colours_are_shared_and_luma_stays(residual):
     gray = np.random.default_rng(1).uniform(0, 255, (80, 100, 3)).astype(np.float32)
     luma = luma_weights("bt709")
-    found = refine(gray, residual, luma, 2, np.random.default_rng(2))
+    found = refine(gray, residual, luma, 2, np.random.default_rng(2), (0, 0))
     inside = a_disc(radius=38.0).inside
     np.testing.assert_allclose((found @ luma)[~inside], (gray @ luma)[~inside], atol=ROUNDING * 10)
     assert np.abs((found - gray) @ luma)[inside].mean() > 0.1
@@ -69,8 +69,8 @@ def test_outside_the_disc_only_colours_are_shared_and_luma_stays(residual):
 
 def test_a_window_of_a_frame_is_refined_as_in_the_whole_frame(residual):
     gray = np.random.default_rng(1).uniform(0, 255, (80, 100, 3)).astype(np.float32)
-    whole = refine(gray, residual, luma_weights("bt709"), 2)
-    part = refine(gray[10:70, 21:], residual, luma_weights("bt709"), 2, origin_px=(21, 10))
+    whole = refine(gray, residual, luma_weights("bt709"), 2, None, (0, 0))
+    part = refine(gray[10:70, 21:], residual, luma_weights("bt709"), 2, None, (21, 10))
     reach = 5  # px that the four kernels see
     np.testing.assert_allclose(part[reach:-reach, reach:], whole[10 + reach : 70 - reach, 21 + reach :], atol=ROUNDING * 10)
 
@@ -104,7 +104,7 @@ def test_the_same_seed_teaches_the_same_network_and_teaching_changes_it(monkeypa
         monkeypatch.setattr(teaching, name, few)
     spec = changed(load_sensor("ur5-331"), response={"residual": None})
     light = [np.random.default_rng(k).uniform(0, 0.4, (80, 100, 3)).astype(np.float32) for k in range(2)]
-    real = [np.clip(before_stream(x, spec.capture) + 9, 0, 255).astype(np.uint8) for x in light]
+    real = [np.clip(before_stream(x, spec.capture, None) + 9, 0, 255).astype(np.uint8) for x in light]
     first, second, longer = (teach(real, light, spec, a_disc(radius=60.0), steps=steps) for steps in (3, 3, 4))
     assert first == second and first != longer
 

@@ -8,14 +8,13 @@ import pytest
 from scenes import RigSpec, load_experiment, load_object, load_sensor
 from scenes.body import SkinSpec
 from twin.geometry.solid import Resolution
-from twin.mechanics.balance import Friction
 from twin.mechanics.follow import Follower
+from twin.mechanics.law import Friction
 from twin.mechanics.path import ContactPath
 from twin.mechanics.solver import SkinSolver
 from twin.rig.contact import RigContact, contact_law, friction_between
-from twin.rig.kinematics import object_pose
+from twin.rig.kinematics import Mounting, object_pose
 from twin.rig.labels import ArmLabel
-from twin.rig.mounting import Mounting
 
 COARSE = Resolution(across=8)
 ANGLE_DEG = 1.0  # of the label: so near to the apex both solvers refine the same part of the skin
@@ -125,7 +124,7 @@ def test_the_rigs_friction_counts_and_the_objects_where_there_is_no_rig():
     rig = RigSpec(tcp_to_dome_mm=0.0, friction=0.3)
     assert friction_between(rig, rubber) == Friction(0.3, 0.3)
     assert friction_between(None, rubber) == Friction(0.7, 0.4, rubber.slip_weakening_mm, 0.05)
-    mounting = Mounting.on(rig, SURFACE, SkinSpec())
+    mounting = Mounting(rig, SURFACE, SkinSpec())
     assert contact_law(rig, mounting, rubber, friction=0.9).friction == Friction(0.9, 0.9)
     soft = rubber.model_copy(update={"compliance_mm_per_n": 0.1})
     assert contact_law(rig.model_copy(update={"compliance_mm_per_n": 0.2}), mounting, soft).compliance_mm_per_n == pytest.approx(0.3)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from scenes import SpecError, list_experiments, list_objects, list_sensors, load_experiment, load_object, load_sensor
+from scenes import SpecError, list_specifications, load_experiment, load_object, load_sensor
 from scenes.load import SHIPPED
 
 LOADERS = {"sensors": load_sensor, "objects": load_object, "experiments": load_experiment}
@@ -17,17 +17,17 @@ def edited(tmp_path, source, old, new):
 
 
 def test_every_shipped_specification_loads():
-    assert {"mg400-331", "mg400-127", "ur5-331"} <= set(list_sensors())
-    assert {"plane", "sphere", "cylinder", "edge", "can", "mesh-can", "square", "prism", "tin-box"} <= set(list_objects())
-    for name in list_sensors():
+    assert {"mg400-331", "mg400-127", "ur5-331"} <= set(list_specifications("sensors"))
+    assert {"plane", "sphere", "cylinder", "edge", "can", "mesh-can", "square", "prism", "tin-box"} <= set(list_specifications("objects"))
+    for name in list_specifications("sensors"):
         assert load_sensor(name).name == name
-    for name in list_objects():
+    for name in list_specifications("objects"):
         assert load_object(name).name == name
-    for name in list_experiments():
+    for name in list_specifications("experiments"):
         assert load_object(load_experiment(name).object).name
 
 
-WIDE = [name for name in list_experiments() if load_experiment(name).wide]
+WIDE = [name for name in list_specifications("experiments") if load_experiment(name).wide]
 
 
 @pytest.mark.parametrize("name", WIDE)

@@ -28,11 +28,11 @@ class Rescaled(Elements):
         out += self.per_mm3 * gradient
         return self.per_mm3 * grown
 
-    def add_forces(self, control_mm, stress, out, pressure_mpa=0.0):
-        return super().add_forces(control_mm, stress, out, self.per_mm3 * pressure_mpa)
+    def add_forces(self, control_mm, out, pressure_mpa=0.0):
+        return super().add_forces(control_mm, out, self.per_mm3 * pressure_mpa)
 
-    def stiffness(self, control_mm, stress, pressure_mpa, out, **options):
-        super().stiffness(control_mm, stress, self.per_mm3 * pressure_mpa, out, **options)
+    def stiffness(self, control_mm, pressure_mpa, out, **options):
+        super().stiffness(control_mm, self.per_mm3 * pressure_mpa, out, **options)
 
     @property
     def rest_volume_mm3(self):

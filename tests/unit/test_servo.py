@@ -8,7 +8,7 @@ from hardware.servo.law import Memory, Reading, reading_at, servo_step, tangent_
 from hardware.servo.trajectory import distance_along, jerk, local_smoothness, lost_contacts, smoothness
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 from twin.rig.arm_pose import matrix_of, pose_of
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 
 EXACT_MM = 1e-9
 SERVO = load_servo("surface")

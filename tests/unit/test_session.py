@@ -169,11 +169,12 @@ def test_a_session_behind_a_link_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
-        ("session.json", b"", "session.json is no JSON"),
-        ("session.json", b"[" * 100_000, "session.json is no JSON"),
-        ("session.json", b"[1]", "session.json is not that of a session"),
+        ("session.json", b"", "session.json: damaged, no JSON"),
+        ("session.json", b"[" * 100_000, "session.json: damaged, no JSON"),
+        ("session.json", b"[1]", "session.json: damaged, holds no keys and values"),
+        ("session.json", b"{}", "session.json: is of version None, expected 1"),
         ("session.json", b'{"version": 99}', "version 99, expected 1"),
-        ("session.json", b"\xff\xfe", "session.json is no JSON"),
+        ("session.json", b"\xff\xfe", "session.json: damaged, no JSON"),
         ("session.json", b" " * 2_000_000, "larger than"),
         (STEPS, b"", "ended before its first step"),
         (STEPS, b"1\n2\n", "line 1 is cut or damaged"),

@@ -16,7 +16,7 @@ from training.runs.gaussian_process import Points, fit_two_fidelities
 from training.runs.run import train_run, write_tensors
 from training.runs.run_files import pack, shipped_names
 from training.studies.sim_to_real import model_inversion
-from training.studies.sim_to_real.missed import Left, Missed
+from training.studies.sim_to_real.field import Left, Missed
 from training.studies.sim_to_real.model_inversion import ModelInversion, TwinForwards, TwinRead, _share
 from training.studies.sim_to_real.steps import choose_frames, combine_co_kriging, quadratic_row, states_like, widen_intervals
 from twin.pins import make_reference

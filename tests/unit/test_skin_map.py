@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from scenes import load_object, load_sensor
-from twin.geometry.chart import Focus
-from twin.geometry.shapes import shape_of
+from twin.geometry.shapes import Focus, shape_of
 from twin.geometry.solid import Resolution, build_solid
 from twin.mechanics.contact import contact_points
 from twin.mechanics.path import ContactPose

@@ -8,8 +8,8 @@ from scenes.load import load_object, load_sensor
 from scenes.sensor import SensorSpec
 from twin.camera.projection import project
 from twin.errors import ContactError
-from twin.geometry.chart import Focus
 from twin.geometry.pins import rest_pins
+from twin.geometry.shapes import Focus
 from twin.geometry.solid import Resolution, build_solid, pin_pose
 from twin.mechanics import ContactPose, SkinSolver
 from twin.mechanics.contact import contact_points

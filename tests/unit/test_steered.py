@@ -11,8 +11,7 @@ from scenes import load_sensor
 from training.data.label_code import LabelCode, label_error
 from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
-from training.models.steered.field import waves_of
-from training.models.steered.model import Steered, SteeredSize
+from training.models.steered.model import Steered, SteeredSize, waves_of
 from training.runs.run import train_run
 from training.runs.run_files import pack
 from training.studies.sim_to_real.steps import combine_co_kriging, model_for

@@ -123,7 +123,7 @@ HARMLESS = {
     "the explanation of a constant": ("twin/mechanics/newton.py", '"""Convergence threshold', '"""Otherwise said: convergence threshold'),
     "what an error says": (SOLVER, 'raise ContactError(f"', 'raise ContactError(f"Otherwise said: '),
     "a comment": (SOLVER, "\nclass SkinSolver", "\n# A remark.\nclass SkinSolver"),
-    "formatting": (SOLVER, "import Callable, Iterator", "import (\n    Callable,\n    Iterator,\n)"),
+    "formatting": (SOLVER, "import Callable, Iterator, Sequence", "import (\n    Callable,\n    Iterator,\n    Sequence,\n)"),
     "how results are kept": ("twin/store/atomic.py", "import errno", "import errno\n\nNEW = 1"),
     "a package that only passes names on": ("twin/mechanics/__init__.py", "from twin.mechanics.law", "NEW = 1\nfrom twin.mechanics.law"),
 }

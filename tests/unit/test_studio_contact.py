@@ -9,6 +9,7 @@ import pytest
 from scenes import load_experiment, load_object, load_sensor
 from training.estimate.estimator import PoseEstimator
 from twin.camera.capture import expose
+from twin.camera.projection import project_in_form
 from twin.errors import ContactError, FrameError
 from twin.mechanics.path import deepest_mm
 from twin.optics.preview import Preview
@@ -126,7 +127,8 @@ def test_what_moves_is_near_the_fine_mesh():
         fine = contact.refine()
     assert fine is not None and fine.mesh is SolvedMesh.FINE and usual.mesh is SolvedMesh.USUAL
     assert fine.pose == usual.pose
-    assert np.linalg.norm(fine.caps_px - usual.caps_px, axis=1).mean() < PIN_PX
+    fine_px, usual_px = (project_in_form(SENSOR, Form.RAW, answer.state.caps_mm) for answer in (fine, usual))
+    assert np.linalg.norm(fine_px - usual_px, axis=1).mean() < PIN_PX
     assert np.linalg.norm(fine.state.force_n - usual.state.force_n) < FORCE_SHARE * np.linalg.norm(fine.state.force_n)
 
 

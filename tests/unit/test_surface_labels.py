@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from scenes import load_experiment, load_object, load_sensor
-from twin.rig.kinematics import object_pose, rig_of
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting, object_pose, rig_of
 from twin.rig.touch import SmoothSurface, surface_labels
 
 SAME_MM, SAME_DEG = 3e-3, 1e-4  # what a plate that leans by a degree, or an arm whose other axes are off a little, leaves out

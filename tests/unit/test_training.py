@@ -19,8 +19,7 @@ from training.estimate.estimator import PoseEstimator
 from training.estimate.loading import digest_of, models_by_sensor
 from training.models import recipe_of
 from training.models.part import Prediction
-from training.runs.config import training_rows
-from training.runs.identity import changed_since, trained_before
+from training.runs.config import changed_since, trained_before, training_rows
 from training.runs.run import fold_rows, is_finished, train_run
 from training.runs.run_files import folder_of, read_tensors
 from training.studies.evaluation import Evaluation, Predictions
@@ -87,7 +86,7 @@ def with_other_names(data):
 CHANGES = {
     "other labels": with_other_labels,
     "other labels ": with_other_moves,
-    "other frames under the same names": with_another_frame,
+    "other frames, or other pins found in them, under the same names": with_another_frame,
     "frames of other names": with_other_names,
 }
 

@@ -9,7 +9,7 @@ import pytest
 from made_records import COLOUR, made_episode
 from PIL import Image
 
-from hardware.cameras.coded import decode_picture
+from hardware.cameras.mjpeg import decode_picture
 from twin.errors import FrameError
 from twin.frames import frames_at, open_recording
 from twin.frames.videos import describe_pauses

@@ -250,7 +250,7 @@ def test_check_names_stretch_and_mirror():
     }
     assert found["mirror"].verdict is Grade.FAILED and found["stretch"].verdict is Grade.FAILED and "10" in found["stretch"].text
     plain = {f.name: f for f in examine([drawn(model_of("mg400-127"), known_of("mg400-127"))], load_sensor("mg400-127"))}
-    assert plain["mirror"].verdict is Grade.HEALTHY and "can't be seen" in plain["mirror"].text
+    assert plain["mirror"].verdict is Grade.UNSURE and "can't be seen" in plain["mirror"].text and "two pushes" in plain["mirror"].remedy
 
 
 @pytest.mark.parametrize(("turn_deg", "mirrored"), [(30.0, False), (-100.0, True), (0.0, True)])

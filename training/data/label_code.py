@@ -55,17 +55,14 @@ class LabelCode:
 
     def decode(self, numbers: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Labels (B, K) in mm and deg from numbers (B, E), and the labels' expected errors from those of the numbers (both >= 0)."""
-        values, errors = [], []
-        at = 0
-        for circular in self.circular:
+        labels = np.empty((2, len(numbers), len(self.circular)))
+        for k, circular in enumerate(self.circular):
+            mine = self.label_of == k
             if not circular:
-                values.append(numbers[:, at])
-                errors.append(scale[:, at])
-                at += 1
+                labels[:, :, k] = numbers[:, mine][:, 0], scale[:, mine][:, 0]
                 continue
-            (sine, cosine), (of_sine, of_cosine) = numbers[:, at : at + 2].T, scale[:, at : at + 2].T
+            (sine, cosine), (of_sine, of_cosine) = numbers[:, mine].T, scale[:, mine].T
             square = np.maximum(sine**2 + cosine**2, 1e-12)
-            values.append(np.degrees(np.arctan2(sine, cosine)))
-            errors.append(np.degrees(np.hypot(cosine * of_sine, sine * of_cosine) / square))
-            at += 2
-        return np.stack(values, axis=1), np.stack(errors, axis=1)
+            errors = np.degrees(np.hypot(cosine * of_sine, sine * of_cosine) / square)
+            labels[:, :, k] = np.degrees(np.arctan2(sine, cosine)), errors
+        return labels[0], labels[1]

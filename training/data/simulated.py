@@ -20,8 +20,7 @@ from twin.frames.folders import image_folders
 from twin.frames.forms import frame_size, from_raw, recording_to_raw
 from twin.frames.tables import LARGEST_BYTES, order_by_table, read_table
 from twin.frames.truth import AGAIN, TRUTH, arrays_of, open_truth, row_of
-from twin.rig.kinematics import object_pose, rig_of
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting, object_pose, rig_of
 from twin.rig.touch import SmoothSurface, surface_labels
 from twin.types import Form
 
@@ -129,7 +128,7 @@ def labels_of_surface(folder: Path, names: np.ndarray) -> dict[str, np.ndarray]:
         rig = rig_of(sensor, config.object.name)
         sent = np.stack([object_pose(rig, config.experiment, each, sensor.skin.apex_mm) for each in pose[mine]])
         sent[:, 2, 3] += config.object.compliance_mm_per_n * force_n[mine, 2]
-        for label, values in surface_labels(config.experiment, Mounting.on(rig, config.experiment, sensor.skin), surface, sent).items():
+        for label, values in surface_labels(config.experiment, Mounting(rig, config.experiment, sensor.skin), surface, sent).items():
             found.setdefault(label, np.full(len(rows), np.nan))[mine] = values
     return found
 

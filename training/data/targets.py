@@ -42,6 +42,9 @@ MEASURED_UNITS = {"Fx": "N", "Fy": "N", "Fz": "N", "Tx": "Nmm", "Ty": "Nmm", "Tz
 TARGET_COLUMNS = ("raw", "corrected", "executed", "move")
 # Units of pose_1 to pose_6, and of move_1 to move_6.
 UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
+# Kinds of columns about the arm, and the units of their axes.
+KINDS = ("pose", "move", "shear")
+AXES = dict(zip(("1", "2", "3", "4", "5", "6", "x", "y", "z", "Rx", "Ry", "Rz"), 2 * UNITS, strict=True))
 
 
 def limits_of(names: Sequence[str]) -> np.ndarray:
@@ -104,19 +107,10 @@ def unit_of(name: str) -> str:
     if name in CONTACT_UNITS or name in MEASURED_UNITS:
         return (CONTACT_UNITS | MEASURED_UNITS)[name]
     kind, _, axis = name.partition("_")
-    if kind in ("pose", "move", "shear"):
-        if axis in "123456" and len(axis) == 1:
-            return UNITS[int(axis) - 1]
-        if axis in ("x", "y", "z"):
-            return "mm"
-        if axis in ("Rx", "Ry", "Rz"):
-            return "deg"
-    return {"force": "N", "torque": "Nmm"}.get(kind, "")
+    return AXES.get(axis, "") if kind in KINDS else {"force": "N", "torque": "Nmm"}.get(kind, "")
 
 
-def choose_targets(
-    recording: Recording, columns: str | tuple[str, ...], rows: np.ndarray, depth_per_move: float, problems: list[str]
-) -> Targets:
+def choose_targets(recording: Recording, columns: str | tuple, rows: np.ndarray, depth_per_move: float, problems: list[str]) -> Targets:
     """Labels of the recording's frames ``rows`` (M,); ``depth_per_move`` is c above.
 
     Raises
@@ -141,21 +135,18 @@ def choose_targets(
             f"choose columns of these, or one of {', '.join((*PRESETS, CONTACT))}"
         )
     raw = np.column_stack([_numbers(recording.labels[name], name, problems) for name in names])[rows]
-    both = all(name in recording.labels for name in (SHEAR, TURN))
-    move = np.full((len(rows), 2), np.nan)
-    if both:
-        move = np.column_stack([_numbers(recording.labels[name], name, []) for name in (SHEAR, TURN)])[rows]
-    executed = np.full(len(rows), np.nan)
-    known = read_executed(recording.path, [recording.names[row] for row in rows], problems) if both else {}
-    if known:
+    move, executed = np.full((len(rows), 2), np.nan), np.full(len(rows), np.nan)
+    if SHEAR in recording.labels and TURN in recording.labels:
+        move = np.column_stack([numbers(recording.labels[name]) for name in (SHEAR, TURN)])[rows]
+        known = read_executed(recording.path, [recording.names[row] for row in rows], problems)
         executed = np.array([known.get(recording.names[row], np.nan) for row in rows])
-    x_mm = _numbers(recording.labels["pose_1"], "pose_1", [])[rows] if "pose_1" in recording.labels else np.zeros(len(rows))
+    x_mm = numbers(recording.labels["pose_1"])[rows] if "pose_1" in recording.labels else np.zeros(len(rows))
     right = correct_labels(names, raw, executed, move, depth_per_move, np.nan_to_num(x_mm))
     undone = 1.0 - np.where(np.isnan(executed), 1.0, executed)
     for k, name in enumerate(names):  # further labels, which published recordings lack: subtract a move that was not executed from each
         made = f"move_{name.removeprefix('pose_')}"
         if name.startswith("pose_") and name != ANGLE and made in recording.labels:
-            right[:, k] -= undone * np.nan_to_num(_numbers(recording.labels[made], made, [])[rows])
+            right[:, k] -= undone * np.nan_to_num(numbers(recording.labels[made])[rows])
     return Targets(names, raw, right, executed, move)
 
 
@@ -167,10 +158,9 @@ def contact_columns(recording: Recording) -> tuple[str, ...]:
     FrameError
         The table has no such column.
     """
-    kinds = ("pose", "move", "shear")
     names: list[str] = []
     for name, cells in recording.labels.items():
-        if name in CONTACT_UNITS or name in MEASURED_UNITS or (name.partition("_")[0] in kinds and unit_of(name)):
+        if name in CONTACT_UNITS or name in MEASURED_UNITS or (name.partition("_")[0] in KINDS and unit_of(name)):
             values = np.nan_to_num(numbers(cells))
             twice = any(np.array_equal(values, np.nan_to_num(numbers(recording.labels[other]))) for other in names)
             if np.ptp(values) > 0 and not twice:  # a column of another convention exists under two names and is used once

@@ -65,6 +65,8 @@ SMALL = PatchClassifier((16, 32, 64, 64), first_stride=2, epochs=12)
 STRONGER = PatchClassifier((24, 48, 96, 96), first_stride=1, epochs=24)
 JUDGES = {"small": SMALL, "stronger": STRONGER}
 """The networks of a thorough test."""
+Pictures = list[np.ndarray]
+"""Frames (H, W, 3) or (H, W) uint8."""
 
 
 @dataclass(frozen=True)
@@ -92,13 +94,7 @@ class TwoSample:
 
 
 def two_sample(
-    first: list[np.ndarray],
-    second: list[np.ndarray],
-    inside: np.ndarray,
-    *,
-    classifier: PatchClassifier = SMALL,
-    seed: int = 0,
-    progress: Step = unheard,
+    first: Pictures, second: Pictures, inside: np.ndarray, *, classifier: PatchClassifier = SMALL, seed: int = 0, progress: Step = unheard
 ) -> TwoSample:
     """Test two sets of equally many frames.
 
@@ -108,7 +104,7 @@ def two_sample(
         M frames each; the k-th frames of both sets are held out together.
     inside : (H, W) bool
         The lens disc.
-    classifier : Evaluate
+    classifier : PatchClassifier
     seed : int
         Seed of patches, network and folds. The same seed gives the same result.
     progress : callable, optional
@@ -121,8 +117,7 @@ def two_sample(
     """
     if len(first) != len(second) or len(first) < 2:
         raise FrameError(f"the two-sample test needs equally many frames of both kinds, at least 2; got {len(first)} and {len(second)}")
-    rng = np.random.default_rng(seed)
-    corners = patch_corners(inside)
+    rng, corners = np.random.default_rng(seed), patch_corners(inside)
     sets = [np.stack([as_color(image) for image in images]) for images in (first, second)]
     pairs, folds = len(first), min(FOLDS, len(first))
     fold_of = rng.permutation(np.arange(pairs) % folds)
@@ -138,18 +133,13 @@ def two_sample(
 
 
 def evaluate_classifiers(
-    real: list[np.ndarray],
-    rendered: list[np.ndarray],
-    inside: np.ndarray,
-    *,
-    judges: Mapping[str, PatchClassifier] = JUDGES,
-    progress: Step = unheard,
+    real: Pictures, rendered: Pictures, inside: np.ndarray, *, judges: Mapping[str, PatchClassifier] = JUDGES, progress: Step = unheard
 ) -> dict[str, TwoSample]:
     """Results of several classifiers for real and rendered frames, by the classifiers' names. Parameters are those of `two_sample`."""
     return {name: two_sample(real, rendered, inside, classifier=judge, progress=progress) for name, judge in judges.items()}
 
 
-def evaluate_halves(images: list[np.ndarray], inside: np.ndarray, *, progress: Step = unheard) -> dict[str, TwoSample]:
+def evaluate_halves(images: Pictures, inside: np.ndarray, *, progress: Step = unheard) -> dict[str, TwoSample]:
     """Results of each classifier for halves of the real frames, by the classifiers' names. Parameters are those of `real_halves`."""
     return {name: real_halves(images, inside, classifier=judge, progress=progress) for name, judge in JUDGES.items()}
 
@@ -159,16 +149,14 @@ def accuracy_text(accuracy: float, low: float, high: float) -> str:
     return f"{100 * accuracy:.1f} % ({100 * low:.1f} to {100 * high:.1f} %)"
 
 
-def real_halves(
-    images: list[np.ndarray], inside: np.ndarray, *, classifier: PatchClassifier = SMALL, seed: int = 0, progress: Step = unheard
-) -> TwoSample:
+def real_halves(images: Pictures, inside: np.ndarray, *, classifier: PatchClassifier = SMALL, progress: Step = unheard) -> TwoSample:
     """Test two halves of one set of frames, for ``DIVISIONS`` random divisions: all pairs of frames together.
 
     Parameters
     ----------
     images : list of (H, W, 3) or (H, W) uint8
         4 or more frames; of an odd number one is left out of each division.
-    inside, evaluate, seed, progress
+    inside, classifier, progress
         As `two_sample` takes them.
 
     Raises
@@ -176,12 +164,12 @@ def real_halves(
     FrameError
         There are fewer than four frames.
     """
-    rng, half, correct = np.random.default_rng(seed), len(images) // 2, []
+    rng, half, correct = np.random.default_rng(0), len(images) // 2, []
     for division in range(DIVISIONS):
         order = rng.permutation(len(images))
         first, second = ([images[k] for k in part] for part in (order[:half], order[half : 2 * half]))
         step = partial(_part, progress, division, DIVISIONS)
-        correct.append(two_sample(first, second, inside, classifier=classifier, seed=seed + division, progress=step).by_pair)
+        correct.append(two_sample(first, second, inside, classifier=classifier, seed=division, progress=step).by_pair)
     return _outcome(np.concatenate(correct), rng)
 
 

@@ -7,11 +7,9 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from stable_baselines3.common.vec_env import VecEnv
 
-from training.environments.environment import TactileVectorEnv
+from training.environments.environment import Seen, TactileVectorEnv
 from twin.errors import OptionError
 from twin.types import FloatArray
-
-Seen = dict[str, Any]
 
 
 class BaselinesVecEnv(VecEnv):

@@ -4,16 +4,19 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from os import PathLike
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from gymnasium import spaces
+from pydantic import BeforeValidator, ConfigDict, Field, ModelWrapValidatorHandler, ValidationError, model_validator
+from pydantic.dataclasses import dataclass as checked
 
 from scenes import ObjectSpec, RandomisationSpec, SensorSpec, load_experiment, load_object, load_randomisation, load_sensor
+from scenes.base import problem_text
 from scenes.files import quote
-from training.environments.observe import IMAGE_PX, KINDS, PICTURES, Eye, Kind, Pictures
+from training.environments.observe import IMAGE_PX, Eye, Kind, Pictures
 from training.environments.tasks import TASKS, StepOutcome, WorldState, add_tasks
-from training.environments.world import AXES, Surfaces, Tool, motions
+from training.environments.world import AXES, Axis, Surfaces, Tool, motions
 from training.generation.config import draw_friction, draw_sensor
 from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.model import is_mechanical, surrogate_of
@@ -24,7 +27,6 @@ from twin.rig.touch import TrueTouch
 from twin.types import BoolArray, FloatArray, Frame, ImageArray, IntArray
 
 BackendName = Literal["surrogate", "fem"]
-BACKENDS: tuple[str, ...] = get_args(BackendName)
 """Names of the contact solvers."""
 PERIOD_S = 0.1
 """Duration of a step, s: an agent decides ten times per second."""
@@ -32,16 +34,8 @@ MOST_STACK = 16
 """Most observations that can be stacked."""
 MOST_ORACLE = 100.0
 """Largest size of the values that only a simulation knows. Larger values are clipped."""
-EXAMPLES = {"axes": ("z", "Ry"), "objects": ("plane", "can")}
-"""Example values, for error messages, of the options that take several names."""
 RESET_OPTIONS = ("object",)
 """Keys that ``reset(options=...)`` accepts."""
-
-
-def require_whole(name: str, given: Any, least: int) -> None:
-    """Raise ``OptionError`` unless the value is a whole number of at least ``least``."""
-    if not isinstance(given, int) or isinstance(given, bool) or given < least:
-        raise OptionError(f"{name}={given!r}: expected a whole number of at least {least}")
 
 
 def require_task(task: str) -> None:
@@ -53,12 +47,43 @@ def require_task(task: str) -> None:
         raise OptionError(f"there is no task {task!r}; {hint}tasks are {', '.join(TASKS)}")
 
 
+def _as_name(given: Any) -> str:
+    if not isinstance(given, str | PathLike):
+        raise ValueError("expected a name or a file")
+    return str(given)
+
+
+def _as_tuple(given: Any) -> Any:
+    return (given,) if isinstance(given, str | PathLike) else tuple(given) if isinstance(given, Iterable) else given
+
+
+CHECKED = ConfigDict(strict=True, allow_inf_nan=False, extra="forbid")
+Named = Annotated[str, BeforeValidator(_as_name)]
+Several = BeforeValidator(_as_tuple), Field(min_length=1)
 FORMER_OPTIONS = {"friction_memory": "friction_history"}
 """Present names of options by their names in version 1."""
 
 
-@dataclass(frozen=True)
-class Options:
+@checked(frozen=True, config=CHECKED)
+class Settings:
+    """Base of settings: values of a wrong kind, or out of range, raise ``OptionError``."""
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _name_option(cls, given: Any, check: ModelWrapValidatorHandler[Self]) -> Self:
+        try:
+            return check(given)
+        except ValidationError as error:
+            found, known = error.errors(include_url=False)[0], [field.name for field in fields(cls)]
+            name, said = str(found["loc"][0]), problem_text(found)
+            if name not in known:
+                near = get_close_matches(name, known, n=1)
+                said = f"no such option; did you mean {near[0]!r}?" if near else f"no such option; there are {', '.join(known)}"
+            raise OptionError(f"{name}={quote(repr(found['input']))}: {said}") from error
+
+
+@checked(frozen=True, config=CHECKED)
+class Options(Settings):
     """Options of an environment, given by keyword.
 
     Attributes
@@ -89,46 +114,21 @@ class Options:
         Number of steps of an episode; the task's by default.
     """
 
-    sensor: str = "mg400-331"
+    sensor: Named = "mg400-331"
     observation: Kind = "pins"
-    stack: int = 1
-    axes: tuple[str, ...] | None = None
+    stack: Annotated[int, Field(ge=1, le=MOST_STACK)] = 1
+    axes: Annotated[tuple[Axis, ...], *Several] | None = None
     backend: BackendName = "surrogate"
-    surrogate: str | None = None
-    objects: tuple[str, ...] | None = None
-    randomise: str | None = None
+    surrogate: Named | None = None
+    objects: Annotated[tuple[Named, ...], *Several] | None = None
+    randomise: Named | None = None
     pictures: Pictures = "none"
     friction_history: bool = True
-    steps: int | None = None
+    steps: Annotated[int, Field(ge=1)] | None = None
 
     def __post_init__(self) -> None:
-        for name, values in (("observation", KINDS), ("backend", BACKENDS), ("pictures", PICTURES)):
-            if getattr(self, name) not in values:
-                raise OptionError(f"{name}={getattr(self, name)!r}: expected one of {', '.join(values)}")
-        require_whole("stack", self.stack, 1)
-        if self.stack > MOST_STACK:
-            raise OptionError(f"stack={self.stack!r}: expected at most {MOST_STACK}")
-        if self.steps is not None:
-            require_whole("steps", self.steps, 1)
-        if not isinstance(self.friction_history, bool):
-            raise OptionError(f"friction_history={self.friction_history!r}: expected True or False")
-        for name in ("sensor", "surrogate", "randomise"):
-            given = getattr(self, name)
-            if isinstance(given, PathLike):
-                object.__setattr__(self, name, str(given))
-            elif not (isinstance(given, str) or (given is None and name != "sensor")):
-                raise OptionError(f"{name}={quote(repr(given))}: expected a name or a file")
-        for name in ("axes", "objects"):
-            given = getattr(self, name)
-            if given is not None:
-                parts = (given,) if isinstance(given, str | PathLike) else tuple(given) if isinstance(given, Iterable) else (given,)
-                if not all(isinstance(part, str | PathLike) for part in parts):
-                    raise OptionError(f"{name}={quote(repr(given))}: expected names, such as {name}={EXAMPLES[name]!r}")
-                object.__setattr__(self, name, tuple(str(part) for part in parts))
-        if self.axes is not None and (not self.axes or len(set(self.axes)) < len(self.axes) or not set(self.axes) <= set(AXES)):
-            raise OptionError(f"axes={self.axes!r}: expected some of {', '.join(AXES)}, each once")
-        if self.objects is not None and not self.objects:
-            raise OptionError("objects=(): expected at least one object")
+        if len(set(self.axes or ())) < len(self.axes or ()):
+            raise OptionError(f"axes={self.axes!r}: expected each once")
         if self.backend == "fem" and not self.friction_history:
             raise OptionError("friction_history=False needs backend='surrogate': finite elements always have history-dependent friction")
 
@@ -141,20 +141,12 @@ class Options:
         OptionError
             There is no such option, or a value is not valid.
         """
-        options = {FORMER_OPTIONS.get(name, name): value for name, value in options.items()}
-        known = [field.name for field in fields(cls)]
-        for name in options:
-            if name not in known:
-                near = get_close_matches(name, known, n=1)
-                hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
-                raise OptionError(f"an environment has no option {name!r}; {hint}")
-        return cls(**options)
+        return cls(**{FORMER_OPTIONS.get(name, name): value for name, value in options.items()})
 
 
 def require_known(how: RandomisationSpec | None) -> None:
     """Raise ``OptionError`` for a randomisation of values that are fixed in a surrogate."""
-    drawn = [] if how is None else [key for key in how.sensor if is_mechanical(*key.split("."))]
-    if how is not None and drawn:
+    if how and (drawn := [key for key in how.sensor if is_mechanical(*key.split("."))]):
         raise OptionError(
             f"randomise={how.name!r} samples {drawn[0]}, which the surrogate keeps fixed; use backend='fem', "
             "or a randomisation of friction, camera and noise, such as 'moves'"
@@ -207,7 +199,12 @@ class Batch:
         self.randomisation = load_randomisation(options.randomise) if options.randomise else None
         self.steps = options.steps or self.task.steps
         self._surfaces = Surfaces()
-        self.backend = self._make_backend()
+        if options.backend == "fem":
+            self.backend: Backend = FiniteElements(self.sensor, count)
+        else:
+            require_known(self.randomisation)
+            found = surrogate_of(self.sensor, options.surrogate)
+            self.backend = SurrogateContacts(found, self.sensor, count, friction_history=options.friction_history)
         for name, obj in list(self.objects.items()):
             try:
                 for friction in _ends(self.randomisation):
@@ -216,7 +213,12 @@ class Batch:
                 if options.objects is not None or len(self.objects) == 1:
                     raise
                 del self.objects[name]  # of the task's own objects, only those that the backend knows remain
-        self.eye = self._shows = self._make_eye()
+        noise_px = self.randomisation.pin_noise_px if self.randomisation else 0.0
+        pictures: Pictures = "preview" if options.observation == "image" and options.pictures == "none" else options.pictures
+        self.eye: Eye | None = None
+        if options.observation != "oracle":
+            self.eye = Eye(self.sensor, count, options.observation, pictures=pictures, pin_noise_px=noise_px)
+        self._shows = self.eye or Eye(self.sensor, count, "pins", pictures="none", pin_noise_px=0.0)
         self.axes = options.axes or self.task.axes
         self.action_scale = np.array([self.task.largest_deg if axis.startswith("R") else self.task.largest_mm for axis in self.axes])
         self._rngs: list[np.random.Generator] = [np.random.default_rng(0)] * count
@@ -253,15 +255,12 @@ class Batch:
         name = str(wanted.get("object") or rng.choice(list(self.objects)))
         obj = self.objects.get(name) or load_object(name)
         self.task.require(obj)
-        how, sensor, friction = self.randomisation, self.sensor, None
-        if how is not None and how.friction is not None:
-            friction = draw_friction(how.friction, rng)
-        if how is not None and how.sensor:
-            sensor, _ = draw_sensor(self.sensor, how, rng)
+        how = self.randomisation
+        friction = draw_friction(how.friction, rng) if how and how.friction else None
+        sensor = draw_sensor(self.sensor, how, rng)[0] if how and how.sensor else self.sensor
         contact = self._contact(sensor, obj, friction)
         self.backend.begin(row, contact)
-        if self._shows is not None:
-            self._shows.begin(row, sensor)
+        self._shows.begin(row, sensor)
         start = self.task.begin(row, self.tool, obj, self._surfaces, rng)
         self.T_work[row], self.T_object[row], self.goal[row] = start.T_work, start.T_object, start.goal
         self._rngs[row], self.contacts[row] = rng, contact
@@ -354,10 +353,6 @@ class Batch:
 
     def frame(self, row: int) -> Frame:
         """The sensor's frame of one environment."""
-        if self._shows is None:
-            self._shows = Eye(self.sensor, self.count, "pins", pictures="none", pin_noise_px=0.0)
-            for begun, contact in enumerate(self.contacts):
-                self._shows.begin(begun, contact.sensor if contact else self.sensor)
         return self._shows.frame(row, self.backend.attitude(row), np.random.default_rng(int(self.steps_done[row])))
 
     def begin_info(self) -> dict[str, Any]:
@@ -408,6 +403,8 @@ class Batch:
 
     def _look(self, rows: IntArray, *, first: bool) -> None:
         newest: FloatArray | ImageArray
+        if not len(rows):
+            return
         if self.eye is None:
             newest = self.oracle()[rows].astype(np.float32)
             valid = np.ones(len(rows), bool)
@@ -420,18 +417,3 @@ class Batch:
             return
         kept = np.where(valid.reshape(-1, *[1] * (newest.ndim - 1)), newest, self._seen[rows, -1])
         self._seen[rows] = np.concatenate([self._seen[rows, 1:], kept[:, None]], axis=1)
-
-    def _make_backend(self) -> Backend:
-        if self.options.backend == "fem":
-            return FiniteElements(self.sensor, self.count)
-        require_known(self.randomisation)
-        found = surrogate_of(self.sensor, self.options.surrogate)
-        return SurrogateContacts(found, self.sensor, self.count, friction_history=self.options.friction_history)
-
-    def _make_eye(self) -> Eye | None:
-        options = self.options
-        if options.observation == "oracle":
-            return None
-        noise_px = self.randomisation.pin_noise_px if self.randomisation else 0.0
-        pictures: Pictures = "preview" if options.observation == "image" and options.pictures == "none" else options.pictures
-        return Eye(self.sensor, self.count, options.observation, pictures=pictures, pin_noise_px=noise_px)

@@ -5,11 +5,13 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from training.environments.batch import PERIOD_S, Batch, Options, require_whole
+from training.environments.batch import CHECKED, PERIOD_S, Batch, Options, Settings, checked
 from twin.errors import TwinError, format_count
 from twin.frames.lerobot import RESTS
 from twin.progress import Progress, silent, stage
@@ -24,18 +26,14 @@ MOST_FAILED = 20
 """Largest number by which failed episodes may exceed the solved ones."""
 
 
-@dataclass(frozen=True)
-class DemonstrationPlan:
+@checked(frozen=True, config=CHECKED)
+class DemonstrationPlan(Settings):
     """What is demonstrated: ``episodes`` solved episodes of a task in an environment with ``options``."""
 
     task: str
     options: Options = field(default_factory=Options)
-    episodes: int = 50
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        require_whole("episodes", self.episodes, 1)
-        require_whole("seed", self.seed, 0)
+    episodes: Annotated[int, Field(ge=1)] = 50
+    seed: Annotated[int, Field(ge=0)] = 0
 
 
 @dataclass(frozen=True, repr=False)
@@ -134,13 +132,10 @@ def _play(batch: Batch) -> tuple[list[RecordStep], bool]:
     steps: list[RecordStep] = []
     while True:
         frame, felt, T, action = batch.frame(0), batch.backend.felt, batch.T_work[0], batch.expert()
-        values = {
-            "pins": batch.eye.view(0).pipeline(frame).pins_px,
-            "pose": np.concatenate([T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_euler("xyz", degrees=True)]),
-            "wrench": np.concatenate([felt.force_n[0], felt.torque_nmm[0]]),
-            "goal": batch.goals_for_agents()[0],
-            "action": action[0],
-        }
+        pins_px, turn = batch.eye.view(0).pipeline(frame).pins_px, Rotation.from_matrix(T[:3, :3])
+        pose = np.concatenate([T[:3, 3], turn.as_euler("xyz", degrees=True)])
+        wrench = np.concatenate([felt.force_n[0], felt.torque_nmm[0]])
+        values = {"pins": pins_px, "pose": pose, "wrench": wrench, "goal": batch.goals_for_agents()[0], "action": action[0]}
         single = {name: np.asarray(value, np.float32) for name, value in values.items()}
         steps.append(RecordStep(frame.image, len(steps) * PERIOD_S, single))
         after = batch.step(action, np.zeros(1, int))

@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 
 from training.environments.batch import Batch, Options
 from twin.errors import OptionError
-from twin.types import FloatArray, ImageArray
+from twin.types import BoolArray, FloatArray, ImageArray
 
 if TYPE_CHECKING:
     from twin.studio.modes.episode import EpisodePage
@@ -132,24 +132,14 @@ class TactileEnv(gymnasium.Env[Seen, FloatArray]):
         if self._page is None:
             self._page = EpisodePage(f"TacTip episode: {self.spec.id if self.spec else batch.sensor.name}", batch.sensor, frame.form)
             print(f"open {self._page.url} in a browser: it shows the episode", file=sys.stderr, flush=True)
-        T = batch.tool.object_poses(batch.T_work, batch.T_object)[0]
-        place_mm, felt = batch.touch().place_mm[0], batch.backend.felt
+        T, felt = batch.tool.object_poses(batch.T_work, batch.T_object)[0], batch.backend.felt
+        foot_mm = T[:3, :3] @ batch.touch().place_mm[0] + T[:3, 3]
         goal = ", ".join(map(_in_units, batch.task.goal_names, batch.goals_for_agents()[0].tolist()))
         area = f"{felt.area_mm2[0]:.0f} mm2, {100 * felt.slip[0]:.0f} %"
-        shown = {"goal": goal, "contact area, slipping": area, "not computed": felt.lost[0]}
-        self._page.show(
-            EpisodeStep(
-                int(batch.steps_done[0]),
-                frame,
-                batch.backend.attitude(0),
-                contact.obj,
-                T,
-                felt.force_n[0].copy(),
-                T[:3, :3] @ place_mm + T[:3, 3],
-                reward,
-                {name: text for name, text in shown.items() if text},
-            )
-        )
+        told = {"goal": goal, "contact area, slipping": area, "not computed": felt.lost[0]}
+        told = {name: text for name, text in told.items() if text}
+        number, pins, force_n = int(batch.steps_done[0]), batch.backend.attitude(0), felt.force_n[0].copy()
+        self._page.show(EpisodeStep(number, frame, pins, contact.obj, T, force_n, foot_mm, reward, told))
         time.sleep(max(0.0, self._shown_s + 1 / RENDER_FPS - time.monotonic()))
         self._shown_s = time.monotonic()
 
@@ -231,34 +221,27 @@ class TactileVectorEnv(VectorEnv[Seen, FloatArray, FloatArray]):
         self._require_open()
         if not self._begun:
             raise OptionError("step() before reset(); call reset() first")
-        again = np.flatnonzero(self._ended)
-        rows = np.flatnonzero(~self._ended)
-        if len(again):
-            self._restart(again, None)
-        done = self.batch.step(actions, rows) if len(rows) else None
         begun = self._ended
-        info = _of_rows(self.batch.begin_info(), begun)
-        if done is None:
-            nothing = np.zeros(self.num_envs, bool)
-            self._ended = nothing.copy()
-            return self.batch.observation(), np.zeros(self.num_envs), nothing, nothing.copy(), info
-        ended = done.terminated | done.truncated
-        mode = self.metadata["autoreset_mode"]
-        if mode is AutoresetMode.NEXT_STEP:
+        self._restart(np.flatnonzero(begun), None)
+        done = self.batch.step(actions, np.flatnonzero(~begun))
+        ended, info = done.terminated | done.truncated, _of_rows(self.batch.begin_info(), begun)
+        if self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP:
             info |= _of_rows(done.info, ~begun)
             self._ended = ended
         else:
-            info |= _of_rows(done.info, ~ended)
-        if mode is AutoresetMode.SAME_STEP and ended.any():
-            last = self.batch.observation()
-            final = np.full(self.num_envs, None, object)
-            for row in np.flatnonzero(ended):
-                final[row] = {key: values[row] for key, values in last.items()}
-            info["final_obs"], info["_final_obs"] = final, ended.copy()
-            info["final_info"], info["_final_info"] = _of_rows(done.info, ended), ended.copy()
-            self._restart(np.flatnonzero(ended), None)
-            info |= _of_rows(self.batch.begin_info(), ended)
+            info |= _of_rows(done.info, ~ended) | self._end_at_once(ended, done.info)
         return self.batch.observation(), done.reward, done.terminated, done.truncated, info
+
+    def _end_at_once(self, ended: BoolArray, told: dict[str, Any]) -> dict[str, Any]:
+        """Begin an episode in the rows (B,) in which one ended. Returns the entries of ``info`` about both episodes."""
+        if not ended.any():
+            return {}
+        last, final = self.batch.observation(), np.full(self.num_envs, None, object)
+        for row in np.flatnonzero(ended):
+            final[row] = {key: values[row] for key, values in last.items()}
+        self._restart(np.flatnonzero(ended), None)
+        info = {"final_obs": final, "_final_obs": ended.copy(), "final_info": _of_rows(told, ended), "_final_info": ended.copy()}
+        return info | _of_rows(self.batch.begin_info(), ended)
 
     def render(self) -> tuple[ImageArray, ...] | None:
         """The frames of all rows, each (H, W, 3) uint8, if the render mode is ``rgb_array``; else None.

@@ -10,21 +10,21 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
+from pydantic import Field
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
 from training.environments.baselines import BaselinesVecEnv
-from training.environments.batch import Options, require_task, require_whole
+from training.environments.batch import CHECKED, Options, Settings, checked, require_task
 from training.environments.environment import TactileVectorEnv
 from training.environments.observe import Pictures
 from training.environments.policy_domain import with_domain
-from twin.errors import OptionError
 from twin.policy import Policy, flatten
 from twin.progress import Progress, Step, silent, stage
 from twin.report.charts import new_figure, save_figure
@@ -59,8 +59,8 @@ ROWS_JUDGED = 8
 """Number of episodes that are evaluated together on the surrogate."""
 
 
-@dataclass(frozen=True)
-class LearnPlan:
+@checked(frozen=True, config=CHECKED)
+class LearnPlan(Settings):
     """Settings of the learning of a policy.
 
     Attributes
@@ -84,19 +84,15 @@ class LearnPlan:
 
     task: str
     options: Options = field(default_factory=Options)
-    minutes: float = 30.0
-    environments: int = 32
-    seed: int = 0
-    episodes: int = 100
-    fem_episodes: int = 0
+    minutes: Annotated[float, Field(gt=0)] = 30.0
+    environments: Annotated[int, Field(ge=2)] = 32
+    seed: Annotated[int, Field(ge=0)] = 0
+    episodes: Annotated[int, Field(ge=1)] = 100
+    fem_episodes: Annotated[int, Field(ge=0)] = 0
     sight: bool = True
 
     def __post_init__(self) -> None:
         require_task(self.task)
-        if not (self.minutes > 0 and np.isfinite(self.minutes)):
-            raise OptionError(f"minutes={self.minutes!r}: expected more than 0")
-        for name, least in (("environments", 2), ("episodes", 1), ("fem_episodes", 0), ("seed", 0)):
-            require_whole(name, getattr(self, name), least)
 
 
 @dataclass(frozen=True, repr=False)
@@ -128,7 +124,7 @@ class SteppedTogether(BaselinesVecEnv):
 
     def seen(self, observed: dict[str, Any]) -> FloatArray:
         """See ``BaselinesVecEnv``."""
-        return self.policy.reduce_inputs(*_split_observation(observed))
+        return self.policy.reduce_inputs(observed["tactile"], observed["goal"])
 
 
 class _Watch(BaseCallback):
@@ -144,12 +140,8 @@ class _Watch(BaseCallback):
     def _on_step(self) -> bool:
         self._ended += [info["is_success"] for info in self.locals["infos"] if "terminal_observation" in info]
         self._rewards.append(float(np.mean(self.locals["rewards"])))
-        return time.monotonic() - self._begun < 60.0 * self._plan.minutes and not self._enough
-
-    @property
-    def _enough(self) -> bool:
-        newest = self._ended[-WINDOW:]
-        return len(self._ended) >= 2 * WINDOW and float(np.mean(newest)) >= ENOUGH
+        enough = len(self._ended) >= 2 * WINDOW and float(np.mean(self._ended[-WINDOW:])) >= ENOUGH
+        return time.monotonic() - self._begun < 60.0 * self._plan.minutes and not enough
 
     def _on_rollout_end(self) -> None:
         seconds = time.monotonic() - self._begun
@@ -184,9 +176,8 @@ def learn_policy(plan: LearnPlan, out: Path, *, progress: Progress = silent) -> 
     written = [out / "policy.safetensors", out / "learning.csv", out / "learning.png", out / "result.json"]
     made.save(written[0])  # saved before it is evaluated, because evaluating takes long and may be interrupted
     _write_curve(watch.curve, written[1], written[2])
-    success: dict[str, float] = {
-        str(plan.options.backend): evaluate_policy(made, plan.task, plan.options, plan.episodes, seed=10_000 + plan.seed)
-    }
+    judged = evaluate_policy(made, plan.task, plan.options, plan.episodes, seed=10_000 + plan.seed)
+    success: dict[str, float] = {str(plan.options.backend): judged}
     if not plan.options.friction_history:
         remembering = replace(plan.options, friction_history=True)
         success["surrogate, friction history"] = evaluate_policy(made, plan.task, remembering, plan.episodes, seed=10_000 + plan.seed)
@@ -228,16 +219,11 @@ def evaluate_policy(policy: Policy, task: str, options: Options, episodes: int, 
     share = np.array([len(range(row, episodes, rows)) for row in range(rows)])
     ended = solved = np.zeros(rows, int)
     while (ended < share).any():
-        seen, _, terminated, truncated, results = vector.step(policy.act(*_split_observation(seen)))
+        seen, _, terminated, truncated, results = vector.step(policy.act(seen["tactile"], seen["goal"]))
         counted = (terminated | truncated) & (ended < share)
         if counted.any():
             ended, solved = ended + counted, solved + (counted & results["final_info"]["is_success"])
     return float(solved.sum() / episodes)
-
-
-def _split_observation(observed: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
-    """The parts of an observation in the form of a policy's input."""
-    return observed["tactile"], observed["goal"]
 
 
 def _untrained_inputs(plan: LearnPlan, vector: TactileVectorEnv) -> Policy:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal
 
 import cv2
 import numpy as np
@@ -25,10 +25,8 @@ if TYPE_CHECKING:
     from training.estimate.estimator import PoseEstimator
 
 Kind = Literal["oracle", "pins", "graph", "image", "pose"]
-KINDS: tuple[str, ...] = get_args(Kind)
 """Names of the observations."""
 Pictures = Literal["none", "preview", "traced"]
-PICTURES: tuple[str, ...] = get_args(Pictures)
 """Ways to make frames: none, rasterised, or path-traced."""
 IMAGE_PX = 128
 """Side of the pictures that an agent gets, px, as in Tactile Gym."""
@@ -58,7 +56,17 @@ class SensorView:
     @cached_property
     def paint(self) -> Callable[[PinState, np.random.Generator], Frame]:
         """Function that makes a frame of a state."""
-        return _painter(self.sensor, self.form, self.pictures)
+        sensor, recording = self.sensor, self.sensor.recording if self.form == Form.PROCESSED else None
+        preview = Preview(sensor, window_px=recording.crop_px if recording else None)
+        renderer = Renderer(sensor, quality="preview", window_px=preview.window_px) if self.pictures == "traced" else None
+        frame_size(sensor, self.form)
+
+        def paint(pins: PinState, rng: np.random.Generator) -> Frame:
+            light = preview.render(pins) if renderer is None else renderer.render(pins, seed=int(rng.integers(2**31)))
+            image = expose(light, sensor.capture, rng, origin_px=preview.window_px[:2])
+            return Frame(record(image, recording, origin_px=preview.window_px[:2]) if recording else image, self.form)
+
+        return paint
 
     @cached_property
     def at_rest(self) -> Frame:
@@ -77,9 +85,8 @@ class SensorView:
         try:
             return Pipeline(self.sensor, self.form, measure_reference(self.sensor, self.form, self.at_rest))
         except FrameError as error:
-            raise OptionError(
-                f"the pins of the sampled {self.sensor.name} can't be found at rest ({error}); narrow the randomisation"
-            ) from error
+            problem = f"the pins of the sampled {self.sensor.name} can't be found at rest ({error})"
+            raise OptionError(f"{problem}; narrow the randomisation") from error
 
 
 class Eye:
@@ -103,12 +110,10 @@ class Eye:
 
     def __init__(self, sensor: SensorSpec, count: int, kind: Kind, *, pictures: Pictures, pin_noise_px: float) -> None:
         self.sensor, self.kind, self.pictures, self._noise_px = sensor, kind, pictures, pin_noise_px
-        self._estimator: PoseEstimator | None = None
-        self._sees_light = False
-        if kind == "pose":
-            self._estimator, self._sees_light = _load_estimator(sensor)
-            if self._sees_light and pictures == "none":
-                raise OptionError(f"observation 'pose': the weights of {sensor.name} also need the light on caps; give pictures='preview'")
+        self._estimator = _load_estimator(sensor) if kind == "pose" else None
+        self._sees_light = self._estimator is not None and getattr(self._estimator.part, "sees_light", False)
+        if self._sees_light and pictures == "none":
+            raise OptionError(f"observation 'pose': the weights of {sensor.name} also need the light on caps; give pictures='preview'")
         self.form = self._estimator.form if self._estimator else Form.PROCESSED if sensor.recording else Form.RAW
         self.reference = nominal_reference(sensor, self.form)
         self._spacing = float(self.reference.spacing_px.mean())
@@ -118,13 +123,11 @@ class Eye:
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape of one observation of one environment, without the stack of earlier ones."""
-        pins = self.sensor.pins.count
         if self.kind == "image":
             return IMAGE_PX, IMAGE_PX
-        if self.kind == "pose":
-            assert self._estimator is not None
+        if self._estimator is not None:
             return (len(self._estimator.names) + 1,)
-        return (pins, 2) if self.kind == "pins" else (pins, 5)
+        return self.sensor.pins.count, 2 if self.kind == "pins" else 5
 
     @property
     def limit(self) -> float:
@@ -168,74 +171,42 @@ class Eye:
         if self.kind == "pins":
             return np.clip((pins_px - self.reference.pins_px) / self._spacing, -self.limit, self.limit).astype(np.float32)
         graphs = [make_graph("voronoi", pins, outmost=self.reference.outmost, net=self.reference.net) for pins in pins_px]
-        if self.kind == "graph":
+        if self._estimator is None:
             seen = np.stack([node_features(graph, self.reference) for graph in graphs])
-            return np.clip(seen, -self.limit, self.limit).astype(np.float32)
-        assert self._estimator is not None
-        count = len(pins_px)
-        table = PinTable(
-            self.sensor,
-            self.form,
-            self.reference,
-            np.full(count, ""),
-            pins_px,
-            np.stack([graph.area_px2 for graph in graphs]),
-            np.zeros(pins_px.shape[:2], bool),
-            np.ones(count, bool),
-            measured=True,
-            light=np.zeros(0) if light is None else light,
-        )
-        told = self._estimator.predict_table(table)
-        return self._scale_estimate(told.mean, told.executed)
+        else:
+            seen = self._estimates(self._estimator, pins_px, np.stack([graph.area_px2 for graph in graphs]), light)
+        return np.clip(seen, -self.limit, self.limit).astype(np.float32)
 
     def _of_frames(self, rows: IntArray, frames: list[Frame]) -> tuple[FloatArray, BoolArray]:
         """Observations (R, ...) from frames, through the real pipeline of each row's sensor, and whether each could be made (R,)."""
         pipelines = [self._views[row].pipeline for row in rows.tolist()]
         seen = [pipeline(frame) for pipeline, frame in zip(pipelines, frames, strict=True)]
         valid = np.array([one.valid for one in seen])
-        rest = [pipeline.reference.pins_px for pipeline in pipelines]
-        moved = [one.graph.nodes_px - at if one.graph is not None else np.zeros_like(at) for one, at in zip(seen, rest, strict=True)]
+        rest = [pipeline.reference for pipeline in pipelines]
+        moved = [one.graph.nodes_px - at.pins_px if one.graph else np.zeros_like(at.pins_px) for one, at in zip(seen, rest, strict=True)]
         light = None
         if self._sees_light:
-            light = np.stack(
-                [cap_light(frame, m + at, p.reference) for frame, m, at, p in zip(frames, moved, rest, pipelines, strict=True)]
-            )
+            light = np.stack([cap_light(frame, m + at.pins_px, at) for frame, m, at in zip(frames, moved, rest, strict=True)])
         return self._of_pins(self.reference.pins_px + np.stack(moved), light), valid
 
-    def _scale_estimate(self, value: FloatArray, executed: FloatArray) -> FloatArray:
-        assert self._estimator is not None
-        scale = np.array([POSE_SCALES[unit] for unit in self._estimator.units])
-        known = np.nan_to_num(np.asarray(executed, float).reshape(len(value), 1), nan=1.0)
-        return np.clip(np.concatenate([value / scale, known], axis=1), -self.limit, self.limit).astype(np.float32)
+    def _estimates(self, estimator: "PoseEstimator", pins_px: FloatArray, area_px2: FloatArray, light: FloatArray | None) -> FloatArray:
+        """Scaled estimates (R, K), and whether a move was executed, from pins (R, N, 2), their areas (R, N) and the light on their caps."""
+        names, lost, valid = np.full(len(pins_px), ""), np.zeros(pins_px.shape[:2], bool), np.ones(len(pins_px), bool)
+        columns = names, pins_px, area_px2, lost, valid
+        table = PinTable(self.sensor, self.form, self.reference, *columns, measured=True, light=np.zeros(0) if light is None else light)
+        told, scale = estimator.predict_table(table), np.array([POSE_SCALES[unit] for unit in estimator.units])
+        return np.column_stack([told.mean / scale, np.nan_to_num(np.asarray(told.executed, float), nan=1.0)])
 
 
-def _load_estimator(sensor: SensorSpec) -> tuple["PoseEstimator", bool]:
-    """The shipped estimator of a sensor, and whether it uses the light on the caps."""
+def _load_estimator(sensor: SensorSpec) -> "PoseEstimator":
+    """The shipped estimator of a sensor."""
     from training.estimate.estimator import PoseEstimator  # loads torch, which other observations do not need
-    from training.models.part import PinModel
     from training.runs.run_files import shipped_names
 
     if sensor.name not in shipped_names():
         known = ", ".join(shipped_names())
         raise OptionError(f"observation 'pose' needs shipped weights; {sensor.name} has none (there are those of {known})")
-    found = PoseEstimator.load(sensor.name)
-    return found, isinstance(found.part, PinModel) and found.part.sees_light
-
-
-def _painter(sensor: SensorSpec, form: Form, pictures: Pictures) -> Callable[[PinState, np.random.Generator], Frame]:
-    """Function that makes a frame of one environment's state."""
-    recording = sensor.recording if form == Form.PROCESSED else None
-    window_px = recording.crop_px if recording else None
-    preview = Preview(sensor, window_px=window_px)
-    renderer = Renderer(sensor, quality="preview", window_px=window_px) if pictures == "traced" else None
-    frame_size(sensor, form)
-
-    def paint(pins: PinState, rng: np.random.Generator) -> Frame:
-        light = preview.render(pins) if renderer is None else renderer.render(pins, seed=int(rng.integers(2**31)))
-        image = expose(light, sensor.capture, rng, origin_px=preview.window_px[:2])
-        return Frame(record(image, recording, origin_px=preview.window_px[:2]) if recording else image, form)
-
-    return paint
+    return PoseEstimator.load(sensor.name)
 
 
 def _small(image: ImageArray) -> ImageArray:

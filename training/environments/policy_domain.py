@@ -37,8 +37,7 @@ def with_domain(policy: Policy, vector: TactileVectorEnv, *, seed: int = 0) -> P
     seen, _ = vector.reset(seed=seed)
     walking = np.arange(vector.num_envs) < WALKING * vector.num_envs
     drift = np.zeros((vector.num_envs, len(policy.axes)))
-    rows, episode = [], np.arange(vector.num_envs)
-    episodes = []
+    rows, episodes, episode = [], [], np.arange(vector.num_envs)
     for _ in range(ACTING_STEPS):
         drift = np.clip(0.8 * drift + 0.4 * rng.normal(size=drift.shape), -1, 1)
         seen, _, ended, cut, _ = vector.step(np.where(walking[:, None], drift, policy.act(seen["tactile"], seen["goal"])))

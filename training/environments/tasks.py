@@ -244,10 +244,9 @@ class ContourFollow(SurfaceFollow):
 
     def begin(self, row: int, tool: Tool, obj: ObjectSpec, surfaces: Surfaces, rng: np.random.Generator) -> Start:
         start, surface = super().begin(row, tool, obj, surfaces, rng), surfaces[obj]
+        touch = surface.depth_and_angle(tool.mounting, tool.object_poses(start.T_work[None], start.T_object[None]))
         self.kept[row, 1] = np.linalg.norm(np.diff(surface.outline, axis=0), axis=1).sum()
-        self.kept[row, 2:4] = surface.depth_and_angle(tool.mounting, tool.object_poses(start.T_work[None], start.T_object[None])).place_mm[
-            0, [0, 2]
-        ]
+        self.kept[row, 2:4] = touch.place_mm[0, [0, 2]]
         return start
 
     def evaluate(self, seen: WorldState) -> StepOutcome:
@@ -393,10 +392,9 @@ class ObjectRoll(Task):
         indent = rng.uniform(*self.indents_mm)
         away, toward = self.within_mm * np.sqrt(rng.uniform(size=2)), rng.uniform(0.0, 2 * np.pi, 2)
         start, goal = np.column_stack([away * np.cos(toward), away * np.sin(toward)])  # uniform in a disc
-        T = np.eye(4)
+        T, T_object = np.tile(np.eye(4), (2, 1, 1))
         T[:3, 3] = [0.0, 0.0, indent - tool.mounting.skin_apex_mm] - tool.T_work_sensor[:3, 3]
-        T_object = np.eye(4)  # the ball lies beside the dome's apex, at the same depth as under it
-        T_object[:2, 3] = start
+        T_object[:2, 3] = start  # the ball lies beside the dome's apex, at the same depth as under it
         return Start(T, tuple(map(float, goal)), T_object)
 
     def carry_object(self, reading: ContactReading, T_work: FloatArray, before: FloatArray, T_object: FloatArray) -> FloatArray:

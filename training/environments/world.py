@@ -2,18 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scenes.experiment import ExperimentSpec
-from scenes.object import ObjectSpec
-from scenes.sensor import SensorSpec
-from twin.rig.mounting import Mounting
+from scenes import ExperimentSpec, ObjectSpec, SensorSpec
+from twin.rig.kinematics import Mounting
 from twin.rig.touch import SmoothSurface
 from twin.types import FloatArray
 
-AXES = ("x", "y", "z", "Rx", "Ry", "Rz")
+Axis = Literal["x", "y", "z", "Rx", "Ry", "Rz"]
+AXES: tuple[str, ...] = get_args(Axis)
 """Motions of a tool in its work frame: z out of the dome's apex, x across it in the plane in which a surface is followed."""
 
 
@@ -70,15 +70,6 @@ def turn_about(axis: Sequence[float], deg: float) -> FloatArray:
     return motions(np.concatenate([np.zeros(3), deg * np.asarray(axis, float)])[None])[0]
 
 
-def side_place(surface: SmoothSurface, along_mm: float) -> tuple[FloatArray, float]:
-    """The place (3,) of a surface beside its object's origin along x, and the surface's turn about y there (deg)."""
-    at = np.array([[along_mm, 0.0, 0.0]])
-    for _ in range(20):
-        distance, normal, _ = surface.field.probe(at)
-        at = at - distance[:, None] * normal * [1.0, 0.0, 1.0]
-    return at[0], float(np.degrees(np.arctan2(-normal[0, 0], -normal[0, 2])))
-
-
 def standing_on(tool: Tool, surface: SmoothSurface, along_mm: float, indent_mm: float, angle_deg: float) -> FloatArray:
     """``T_object_work`` (4, 4) of a tool that presses the dome against a surface beside its object's origin.
 
@@ -91,22 +82,25 @@ def standing_on(tool: Tool, surface: SmoothSurface, along_mm: float, indent_mm: 
     angle_deg : float
         Angle of the tool from the surface's normal, about the work frame's y.
     """
-    place, turned_deg = side_place(surface, along_mm)
+    at = np.array([[along_mm, 0.0, 0.0]])
+    for _ in range(20):  # to the surface, in the plane y = 0
+        distance, normal, _ = surface.field.probe(at)
+        at = at - distance[:, None] * normal * [1.0, 0.0, 1.0]
+    turned_deg = float(np.degrees(np.arctan2(-normal[0, 0], -normal[0, 2])))
     outward = turn_about((0, 1, 0), turned_deg)[:3, :3] @ [0.0, 0.0, -1.0]
     T = turn_about((0, 1, 0), turned_deg + angle_deg)
     dome = tool.T_work_sensor[:3, 3]
-    centre = place + (tool.mounting.skin_apex_mm + surface.raised_mm - indent_mm) * outward
+    centre = at[0] + (tool.mounting.skin_apex_mm + surface.raised_mm - indent_mm) * outward
     T[:3, 3] = centre - T[:3, :3] @ dome
     return T
 
 
-class Surfaces:
-    """The surfaces of the objects that a task uses, each built once."""
+class Surfaces(dict[ObjectSpec, SmoothSurface]):
+    """The surfaces of the objects that a task uses, each built once.
 
-    def __init__(self) -> None:
-        self._built: dict[ObjectSpec, SmoothSurface] = {}
+    The key is the whole specification, because two files in different folders may have one name.
+    """
 
-    def __getitem__(self, obj: ObjectSpec) -> SmoothSurface:
-        if obj not in self._built:  # the key is the whole specification, because two files in different folders may have one name
-            self._built[obj] = SmoothSurface(obj)
-        return self._built[obj]
+    def __missing__(self, obj: ObjectSpec) -> SmoothSurface:
+        self[obj] = SmoothSurface(obj)
+        return self[obj]

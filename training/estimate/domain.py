@@ -41,6 +41,8 @@ from twin.types import BoolArray, FloatArray
 
 """File of a run with its domain."""
 FILE = ArrayFile("file of a domain", "twin train", version=3, error=TrainingError, again=AGAIN)
+NUMBERS: dict[str, Any] = {"lighter": int, "near": float, "blind": float, "simulated": bool}
+"""Fields of a domain that are no arrays. Files of earlier versions lack the last one."""
 MODES, LEADING, CUBED = 60, 12, 6
 """Number of principal components, of leading ones, and of those whose products of three are terms of the polynomial."""
 FEWEST = 60
@@ -143,11 +145,6 @@ class Strangeness:
     unknown: float
     uneven: np.ndarray
     ample: float
-
-    @property
-    def usual_camera(self) -> np.ndarray:
-        """Sizes (4,) of the camera's motions relative to ``ample``."""
-        return np.abs(self.camera) / self.ample
 
 
 @dataclass(frozen=True)
@@ -529,27 +526,21 @@ def learn_domain(
     for fold in range(FOLDS):
         here = part == fold
         one = _fit_changes(flat[~here], labelled[~here], motions, rng)
-        measures[here] = [[*found.parts[:3], *found.uneven, *found.usual_camera, found.unknown] for found in map(one, moved[here])]
+        strange = (one(each) for each in moved[here])
+        measures[here] = [[*each.parts[:3], *each.uneven, *(np.abs(each.camera) / each.ample), each.unknown] for each in strange]
     fitted = _fit_changes(flat, labelled, motions, rng)
     limits = np.quantile(measures[:, :-1], 1 - ALLOWED, axis=0)
     limits[3:7] *= np.clip(limits[3:7] / EVEN, 1.0, 1.3)
     floors = np.array([OUTSIDE, *[1.0] * 6, SHIFT, SHIFT, np.radians(TURN_DEG), SCALE])
-    blind = [0.0]
+    unsure = [0.0]
     if lost is not None:
         rows = spread_indices(len(moved), LOST_FRAMES)
-        blind = [fitted.fill_lost(moved[k], lost[k])[1] if lost[k].any() else 0.0 for k in rows]
+        unsure = [fitted.fill_lost(moved[k], lost[k])[1] if lost[k].any() else 0.0 for k in rows]
+    near, blind = (float(np.quantile(values, USUAL_DISTANCE)) for values in (measures[labelled, -1], unsure))
     low, high = np.quantile(labels[labelled], (1 - IN_RANGE, IN_RANGE), axis=0)
-    return replace(
-        fitted,
-        limits=np.maximum(limits, floors),
-        near=float(np.quantile(measures[labelled, -1], USUAL_DISTANCE)),
-        rate=_rates(fitted, flat[labelled], labels[labelled], units, rng),
-        least=least,
-        low=low,
-        high=high,
-        blind=float(np.quantile(blind, USUAL_DISTANCE)),
-        simulated=simulated,
-    )
+    rate = _rates(fitted, flat[labelled], labels[labelled], units, rng)
+    found = replace(fitted, limits=np.maximum(limits, floors), near=near, blind=blind, simulated=simulated)
+    return replace(found, rate=rate, least=least, low=low, high=high)
 
 
 def _fit_changes(flat: np.ndarray, labelled: np.ndarray, motions: np.ndarray, rng: np.random.Generator) -> Domain:
@@ -646,7 +637,7 @@ def _rates(found: Domain, flat: np.ndarray, labels: np.ndarray, units: Sequence[
 def domain_arrays(domain: Domain) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """A domain as arrays and numbers for a file; components and known frames in half precision."""
     arrays = {each.name: getattr(domain, each.name) for each in fields(Domain) if each.init}
-    about = {name: arrays.pop(name) for name in ("lighter", "near", "blind", "simulated")}
+    about = {name: arrays.pop(name) for name in NUMBERS}
     half = ("components", "known", "weight", "whiten")
     return {key: array.astype(np.float16 if key in half else np.float32) for key, array in arrays.items()}, about
 
@@ -659,13 +650,8 @@ def domain_of(arrays: Mapping[str, np.ndarray], about: Mapping[str, Any], pins: 
     ValueError
         It belongs to other pins or labels.
     """
-    found = Domain(
-        **{name: array.astype(float) for name, array in arrays.items()},
-        lighter=int(about["lighter"]),
-        near=float(about["near"]),
-        blind=float(about["blind"]),
-        simulated=bool(about.get("simulated", False)),
-    )
+    values: dict[str, Any] = {name: array.astype(float) for name, array in arrays.items()}
+    found = Domain(**values | {name: kind(about[name]) for name, kind in NUMBERS.items() if name in about})
     if found.mean.shape != (2 * pins,) or found.rate.shape != (labels,):
         raise ValueError("of other pins or labels")
     return found

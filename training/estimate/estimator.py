@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 import torch
@@ -93,7 +94,7 @@ class PoseEstimator:
     Attributes
     ----------
     learnt_from : (m, 2) int64 or None
-        Marks of the model's training frames (``training.runs.identity.frame_marks``); None if the run does not hold them.
+        Marks of the model's training frames (``training.runs.config.frame_marks``); None if the run does not hold them.
     maps : MapModel or None
         Model of contact maps; None if the run did not train it.
     slip : SlipModel or None
@@ -223,9 +224,13 @@ class PoseEstimator:
 
     def keep_names(self) -> "PoseEstimator":
         """The model for consecutive frames, which names pins as in the frame before, without any other use of earlier frames."""
+        return self._with(pipeline=self.pipeline.with_history(), _consecutive=True)
+
+    def _with(self, **changes: Any) -> "PoseEstimator":
+        """A copy with other attributes."""
         found = copy(self)
-        found.pipeline, found._consecutive = self.pipeline.with_history(), True
-        found._trained = replace(self._trained, pipeline=found.pipeline)
+        vars(found).update(changes)
+        found._trained = replace(found._trained, pipeline=found.pipeline, ensemble=found.ensemble)
         return found
 
     @property
@@ -278,33 +283,28 @@ class PoseEstimator:
 
     def with_intervals(self, intervals: Mapping[str, np.ndarray]) -> "PoseEstimator":
         """The same model with other interval quantiles: those of one kind of its frames."""
-        found = copy(self)
-        found.ensemble = copy(self.ensemble)
-        for name, values in intervals.items():
-            setattr(found.ensemble, name, np.asarray(values, float))
-        found._trained = replace(self._trained, ensemble=found.ensemble)
-        return found
+        ensemble = copy(self.ensemble)
+        vars(ensemble).update({name: np.asarray(values, float) for name, values in intervals.items()})
+        return self._with(ensemble=ensemble)
 
     def counted_from(self, reference: Reference, *, measured: bool = False) -> "PoseEstimator":
         """The same model; it measures the pins' displacements from other pins at rest.
 
         If these were ``measured`` without contact, it also estimates whether anything is touched.
         """
-        found = copy(self)
-        found.pipeline = Pipeline(self.sensor, self.form, reference, graph=self.pipeline.graph)
-        touched = TouchAnswer(reference) if measured else self._trained.touched
-        found._trained = replace(self._trained, pipeline=found.pipeline, touched=touched)
-        factors = tuple(self.config.get("other_unit_widens", ()))
-        found._wider = () if not factors or self.rest.same_unit(reference) else factors
+        trained = replace(self._trained, touched=TouchAnswer(reference)) if measured else self._trained
+        wider = tuple(self.config.get("other_unit_widens", ()))
+        if wider and self.rest.same_unit(reference):
+            wider = ()
+        pipeline = Pipeline(self.sensor, self.form, reference, graph=self.pipeline.graph)
+        found = self._with(pipeline=pipeline, _trained=trained, _wider=wider)
         if not self._consecutive:
             return found
         return found.keep_names() if self._tracker is None else found.with_history()
 
     def noting(self, undecided: str) -> "PoseEstimator":
         """The same model; its ``caveats`` say what is ``undecided`` about the camera's view."""
-        found = copy(self)
-        found._undecided = undecided
-        return found
+        return self._with(_undecided=undecided)
 
     def check(self, sensor: SensorSpec, form: Form) -> None:
         """Refuse another sensor or form than the model was trained for.
@@ -330,7 +330,7 @@ class PoseEstimator:
         """
         started = perf_counter()
         if not isinstance(self.part, PinModel):
-            return self._as_estimate(self.part.estimate_frame(self._trained, frame), started, verdict=self._verdict_of(frame))
+            return self._as_estimate(self.part.estimate_frame(self._trained, frame), started, self._verdict_of(frame), "", None, 0.0)
         seen = self.pins_in(frame)
         return self.estimate_without_pose(seen, started) if isinstance(seen, Unseen) else self.estimate_one(seen, started, "")
 
@@ -392,32 +392,23 @@ class PoseEstimator:
         return self.ensemble.modes(inputs, rows).inputs
 
     def _as_estimate(
-        self,
-        made: Prediction | Unseen,
-        started: float,
-        contact: str = "",
-        slip: Slip | None = None,
-        lost: float = 0.0,
-        verdict: DomainVerdict = USUAL_FRAME,
+        self, made: Prediction | Unseen, started: float, verdict: DomainVerdict, contact: str, slip: Slip | None, lost: float
     ) -> PoseEstimate:
-        labels = self.names, self.units
-        excess: np.ndarray = np.zeros(len(self._bounds[0]))
-        if isinstance(made, Prediction) and self.domain is not None:
-            reason = verdict.reason
-            if not reason:
-                reason, excess = self.domain.outside_range(made.mean[0], self.config["columns"], self.config["units"])
-            made = Unseen(reason, made.touched, made.seen) if reason else made
         if isinstance(made, Unseen):
-            if self._tracker is not None:
-                self._tracker.forget()
-            none = np.full(len(self.names), np.nan)
-            return PoseEstimate(*labels, none, none, none, np.nan, False, made.reason, _ms(started), contact, made.touched, seen=made.seen)
+            return self.estimate_without_pose(made, started)
+        reason = verdict.reason
+        excess: np.ndarray = np.zeros(len(self._bounds[0]))
+        if self.domain is not None and not reason:
+            reason, excess = self.domain.outside_range(made.mean[0], self.config["columns"], self.config["units"])
+        if reason:
+            return self.estimate_without_pose(Unseen(reason, made.touched, made.seen), started, contact)
         value, half, executed = made.mean[0], made.half_width[0], float(made.executed[0])
         low, high, notes = self._widening(value, half, lost, verdict, excess)
         value, low, high = (np.clip(each, *self._bounds) for each in (value, low, high))
         if slip is not None:
             value, low, high = (np.concatenate(pair) for pair in zip((value, low, high), slip.values, strict=True))
-        return PoseEstimate(*labels, value, low, high, executed, True, "", _ms(started), contact, made.touched, notes, made.seen)
+        head = self.names, self.units, value, low, high, executed
+        return PoseEstimate(*head, True, "", _ms(started), contact, made.touched, notes, made.seen)
 
     def pins_in(self, frame: Frame) -> OneFrame | Unseen:
         """The pins of one frame, or the reason why they can't be used; raises as a call does."""
@@ -443,7 +434,7 @@ class PoseEstimator:
             places = self.domain.without_camera(pins.nodes_px[0], pins.area_px2[0], verdict.camera, known.spacing_px.mean())
             seen = replace(seen, pins=replace(pins, nodes_px=places[0][None], area_px2=places[1][None]))
         slip = None if self._tracker is None else self._tracker(self.modes_of(seen.pins)[0])
-        return self._as_estimate(self._of_pins.estimate_one(self._trained, seen), started, contact, slip, seen.lost_share, verdict)
+        return self._as_estimate(self._of_pins.estimate_one(self._trained, seen), started, verdict, contact, slip, seen.lost_share)
 
     @property
     def trained_reference(self) -> Reference:
@@ -472,9 +463,13 @@ class PoseEstimator:
             return DomainVerdict(seen.reason)
         return self._verdict(seen.graph.nodes_px, np.isnan(seen.pins_px[:, 0]))
 
-    def estimate_without_pose(self, seen: Unseen, started: float) -> PoseEstimate:
+    def estimate_without_pose(self, seen: Unseen, started: float, contact: str = "") -> PoseEstimate:
         """The estimate of a frame that shows no known pose."""
-        return self._as_estimate(seen, started)
+        if self._tracker is not None:
+            self._tracker.forget()
+        none = np.full(len(self.names), np.nan)
+        head = self.names, self.units, none, none, none, np.nan
+        return PoseEstimate(*head, False, seen.reason, _ms(started), contact, seen.touched, seen=seen.seen)
 
     def predict_rows(self, data: Dataset, rows: np.ndarray) -> Prediction:
         """Estimate the labels of some rows (B,) of a data set whose frames are all of one camera.

@@ -18,7 +18,7 @@ from training.models.part import Unseen
 from twin.errors import FrameError
 from twin.estimate import Estimate, SensorModel
 from twin.frames import spread_indices
-from twin.pins import PinView, Pipeline, Reference, make_reference, measure_reference, view_of
+from twin.pins import PinView, Reference, make_reference, measure_reference, view_of
 from twin.pins.labelling.view import camera_modes
 from twin.types import Form, Frame, Observation
 
@@ -168,9 +168,6 @@ class RestSeeker:
         Whether the estimated rest places differ from the known ones.
     """
 
-    sensor: SensorSpec
-    form: Form
-    pipeline: Pipeline
     counts_from_rest = True
 
     def __init__(self, model: "PoseEstimator") -> None:

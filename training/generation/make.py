@@ -26,6 +26,28 @@ from twin.types import ContactState
 MOST_ATTEMPTS = 20
 # Index of the frame without contact.
 REST = -1
+UNITS = {  # unit and meaning of each array of a contact, in the order in which they are kept
+    "caps_mm": "mm, sensor frame",
+    "caps_px": "px of the frame: exact projection of each cap's centre",
+    "rest_px": "px of the frame: the same sensor without contact",
+    "pins_px": "px of the frame: caps_px with the noise of a measurement",
+    "visible": "whether the cap is inside the frame and no other pin hides it",
+    "force_n": "N, of the skin on the object, sensor frame",
+    "torque_nmm": "N mm about the sensor's origin",
+    "area_mm2": "mm2 of skin in contact: nearer to the object than 0.05 mm",
+    "slipping_mm2": "mm2 of skin that is pressed and slides",
+    "skin_mm": "mm, sensor frame: the outer skin's nodes (the first ones of SensorMesh)",
+    "map_force_n": "N, of the skin on the object at each node of the sensor's skin grid (twin.mechanics.skin_map), sensor frame",
+    "map_normal_n": "N, magnitude of the part of it that presses",
+    "map_touched_mm2": "mm2 of skin that is pressed, at each of these nodes",
+    "map_slipping_mm2": "mm2 of it that slides",
+    "T_sensor_object": "the object's pose, mm",
+    "pose": "pose_1..6 as in targets.csv: mm, deg",
+    "move": "move_1..6 as in targets.csv: mm, deg",
+    "executed": "whether the move had been made when the frame was taken",
+    "path_id": "number of the contact that the state belongs to: split by it, never by row",
+    "fraction": "share of the contact's path that is done",
+}
 
 
 @dataclass(frozen=True)
@@ -92,35 +114,23 @@ def _simulate(config: GenerationConfig, text: str, draw: Draw, index: int, failu
         if config.images != "none":
             images.append(_png(config, simulator, state, draw.image_seed + k))
         rows.append(_row(config, draw, simulator, state, labels[k]) | {"path_id": index, "fraction": fraction})
-    arrays = {key: np.array([row[key] for row in rows]) for key in rows[0]}
+    arrays = {key: np.array([row[key] for row in rows]) for key in UNITS}
     return Outcome(index, images, arrays, {"friction": draw.friction, **draw.values}, failures)
 
 
 def _row(config: GenerationConfig, draw: Draw, simulator: Simulator, state: ContactState, label: ArmLabel) -> dict:
-    """Truth of one state; the keys are the arrays of the data set's ``truth.zarr`` (see ``training.generation.store``)."""
+    """Truth of one state, by the keys of ``UNITS``."""
     truth = cap_truth(draw.sensor, simulator.rest, state, config.form)
     grid = skin_map(draw.sensor.geometry, state)
     noise_px = config.randomisation.pin_noise_px if config.randomisation else 0.0
-    return {
-        "caps_mm": truth.caps_mm.astype(np.float32),
-        "caps_px": truth.caps_px.astype(np.float32),
-        "rest_px": truth.rest_px.astype(np.float32),
-        "pins_px": (truth.caps_px + noise_px * draw.noise.normal(size=truth.caps_px.shape)).astype(np.float32),
-        "visible": truth.visible,
-        "force_n": state.force_n,
-        "torque_nmm": state.torque_nmm,
-        "area_mm2": state.area_mm2,
-        "slipping_mm2": float(state.point_area_mm2[state.slipping].sum()),
-        "skin_mm": state.nodes_mm[: simulator.solver.mesh.outer_count].astype(np.float32),
-        "map_force_n": grid.force_n.astype(np.float32),
-        "map_normal_n": grid.normal_n.astype(np.float32),
-        "map_touched_mm2": grid.touched_mm2.astype(np.float32),
-        "map_slipping_mm2": grid.slipping_mm2.astype(np.float32),
-        "T_sensor_object": state.T_sensor_object,
-        "pose": label.pose,
-        "move": label.move,
-        "executed": label.executed,
-    }
+    single = {"caps_mm": truth.caps_mm, "caps_px": truth.caps_px, "rest_px": truth.rest_px}
+    single |= {"pins_px": truth.caps_px + noise_px * draw.noise.normal(size=truth.caps_px.shape)}
+    single |= {"skin_mm": state.nodes_mm[: simulator.solver.mesh.outer_count]}
+    single |= {f"map_{key}": getattr(grid, key) for key in ("force_n", "normal_n", "touched_mm2", "slipping_mm2")}
+    double = {key: getattr(state, key) for key in ("force_n", "torque_nmm", "area_mm2", "T_sensor_object")}
+    double |= {"slipping_mm2": float(state.point_area_mm2[state.slipping].sum()), "visible": truth.visible}
+    double |= {"pose": label.pose, "move": label.move, "executed": label.executed}
+    return double | {key: value.astype(np.float32) for key, value in single.items()}
 
 
 def _png(config: GenerationConfig, simulator: Simulator, state: ContactState, seed: int) -> bytes:

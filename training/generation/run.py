@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec, load_object
 from training.generation.config import GenerationConfig, Images, States, require_count
@@ -129,18 +130,9 @@ def config_for(
     """
     obj = obj or load_object(experiment.object)
     friction = friction_between(sensor.rig and sensor.rig.for_object(obj.name), obj).static
-    config = GenerationConfig(
-        sensor=sensor,
-        object=obj,
-        experiment=experiment,
-        randomisation=randomisation,
-        friction=friction,
-        seed=experiment.seed if seed is None else seed,
-        images=images,
-        states=states,
-        quality=quality or "rasterised",
-        across=across,
-    )
+    parts: dict[str, Any] = {"sensor": sensor, "object": obj, "experiment": experiment, "randomisation": randomisation}
+    parts |= {"friction": friction, "seed": experiment.seed if seed is None else seed, "images": images, "states": states}
+    config = GenerationConfig(**parts, quality=quality or "rasterised", across=across)
     frame_size(sensor, config.form)
     return config
 

@@ -20,7 +20,7 @@ import zarr
 from scenes.experiment import LABELS
 from scenes.files import read_regular
 from training.generation.config import DatasetError, GenerationConfig
-from training.generation.make import REST, Outcome, make_contact
+from training.generation.make import REST, UNITS, Outcome, make_contact
 from twin import store
 from twin.errors import ErrorsAs, StoreError, format_count
 from twin.frames.truth import TRUTH, image_name
@@ -40,28 +40,6 @@ FAILURE_COLUMNS = ("path_id", "attempt", "reason")
 FILES = (*("meta.json", "init_0.png", "images", "frames_bw", RECORDS, TRUTH), *("targets.csv", "move_executed.csv", DRAWS, "failures.csv"))
 # Number of rows in a chunk of this group's arrays.
 CHUNK_ROWS = 256
-UNITS = {  # unit and meaning of each array in this group
-    "caps_mm": "mm, sensor frame",
-    "caps_px": "px of the frame: exact projection of each cap's centre",
-    "rest_px": "px of the frame: the same sensor without contact",
-    "pins_px": "px of the frame: caps_px with the noise of a measurement",
-    "visible": "whether the cap is inside the frame and no other pin hides it",
-    "force_n": "N, of the skin on the object, sensor frame",
-    "torque_nmm": "N mm about the sensor's origin",
-    "area_mm2": "mm2 of skin in contact: nearer to the object than 0.05 mm",
-    "slipping_mm2": "mm2 of skin that is pressed and slides",
-    "skin_mm": "mm, sensor frame: the outer skin's nodes (the first ones of SensorMesh)",
-    "map_force_n": "N, of the skin on the object at each node of the sensor's skin grid (twin.mechanics.skin_map), sensor frame",
-    "map_normal_n": "N, magnitude of the part of it that presses",
-    "map_touched_mm2": "mm2 of skin that is pressed, at each of these nodes",
-    "map_slipping_mm2": "mm2 of it that slides",
-    "T_sensor_object": "the object's pose, mm",
-    "pose": "pose_1..6 as in targets.csv: mm, deg",
-    "move": "move_1..6 as in targets.csv: mm, deg",
-    "executed": "whether the move had been made when the frame was taken",
-    "path_id": "number of the contact that the state belongs to: split by it, never by row",
-    "fraction": "share of the contact's path that is done",
-}
 
 
 class Store:
@@ -118,16 +96,13 @@ class Store:
             The files can't be written: the disk is full, or the folder no longer exists.
         """
         with ErrorsAs(StoreError, self._unfinished_error):
-            self._keep(outcome)
-
-    def _keep(self, outcome: Outcome) -> None:
-        if outcome.index == REST:
-            store.write_bytes(self.folder / "init_0.png", outcome.images[0])
-            return
-        for state, image in enumerate(outcome.images):
-            store.write_bytes(self.pictures / image_name(outcome.index, state), image)
-        notes = json.dumps({"draw": outcome.draw, "failures": outcome.failures})
-        store.write_npz(self.folder / RECORDS / f"{outcome.index:06d}.npz", {"notes": np.array(notes), **outcome.arrays}, compressed=True)
+            if outcome.index == REST:
+                store.write_bytes(self.folder / "init_0.png", outcome.images[0])
+                return
+            for state, image in enumerate(outcome.images):
+                store.write_bytes(self.pictures / image_name(outcome.index, state), image)
+            record = {"notes": np.array(json.dumps({"draw": outcome.draw, "failures": outcome.failures})), **outcome.arrays}
+            store.write_npz(self.folder / RECORDS / f"{outcome.index:06d}.npz", record, compressed=True)
 
     def finish(self, count: int) -> int:
         """Write tables and truth of the contacts 0 to ``count`` - 1, and return the number of frames."""
@@ -177,15 +152,13 @@ class Store:
 
     def _check_config(self) -> None:
         path, text = self.folder / CONFIG, self.config.text()
-        if path.is_file():
-            before, now = read_record(path), json.loads(text)
-            if before != now:
-                other = ", ".join(key for key in {**now, **before} if before.get(key) != now.get(key))
-                raise DatasetError(f"{self.folder}: holds a data set with other settings ({other}); repeat them, or give another `out`")
-            store.require_same_code(self.folder, make_contact, begun=True)
-            return
-        store.require_same_code(self.folder, make_contact, begun=False)
-        write_text(path, text)  # written last, so that a folder with a configuration also states what code made it
+        begun, now = path.is_file(), json.loads(text)
+        if begun and (before := read_record(path)) != now:
+            other = ", ".join(key for key in {**now, **before} if before.get(key) != now.get(key))
+            raise DatasetError(f"{self.folder}: holds a data set with other settings ({other}); repeat them, or give another `out`")
+        store.require_same_code(self.folder, make_contact, begun=begun)
+        if not begun:
+            write_text(path, text)  # written last, so that a folder with a configuration also states what code made it
 
     def _unfinished_error(self, error: StoreError) -> DatasetError:
         done = len(self.list_finished() - {REST})

@@ -409,19 +409,11 @@ class PinModel(Model):
         touched = float("nan") if trained.touched is None else trained.touched(seen.graph.nodes_px, lost)
         if touched < LIKELY:
             return Unseen(f"no contact (its probability is {touched:.0%})", touched, seen)
-        reference = trained.pipeline.reference
-        pins = PinTable(
-            trained.sensor,
-            trained.pipeline.form,
-            reference,
-            np.array([frame.name]),
-            seen.graph.nodes_px[None],
-            seen.graph.area_px2[None],
-            lost[None],
-            np.ones(1, bool),
-            measured=reference is not trained.reference,
-            light=cap_light(frame, seen.graph.nodes_px, reference)[None] if self.sees_light else np.zeros((1, len(lost))),
-        )
+        graph, reference = seen.graph, trained.pipeline.reference
+        light = cap_light(frame, graph.nodes_px, reference) if self.sees_light else np.zeros(len(lost))
+        columns = np.array([frame.name]), graph.nodes_px[None], graph.area_px2[None], lost[None], np.ones(1, bool)
+        measured = reference is not trained.reference
+        pins = PinTable(trained.sensor, trained.pipeline.form, reference, *columns, measured=measured, light=light[None])
         return OneFrame(pins, touched, 1 - seen.found / max(seen.expected, 1), seen)
 
     def estimate_one(self, trained: Trained, seen: OneFrame) -> Prediction:

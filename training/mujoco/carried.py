@@ -12,8 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from scenes.sensor import SensorSpec
-from training.mujoco.geoms import MM
-from training.mujoco.model import load_scene, scene_file
+from training.mujoco.model import MM, load_scene, scene_file
 from training.mujoco.scene import TactileScene
 from twin.errors import ContactError
 from twin.geometry.mesh import build_mesh

@@ -1,9 +1,12 @@
-"""A TacTip as a part of a robot model: MJCF to attach to a flange or a finger, or URDF.
+"""TacTips and the models of MuJoCo: a sensor as a part of a robot, and a robot's geoms as the solids that a skin is pressed against (mm).
 
-The part's frame lies on its mounting plane with z out of the flange. Skin and housing are drawn; the housing collides, the soft part does
-not: its contacts are those of ``training.mujoco.scene``. Mass and inertia are those of a cylinder of the housing's size.
+A sensor is MJCF to attach to a flange or a finger, or URDF. The part's frame lies on its mounting plane with z out of the flange. Skin and
+housing are drawn; the housing collides, the soft part does not: its contacts are those of ``training.mujoco.scene``. Mass and inertia are
+those of a cylinder of the housing's size.
 """
 
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -12,11 +15,24 @@ import numpy as np
 import trimesh
 
 from scenes.sensor import SensorSpec
-from training.mujoco.geoms import MM
+from training.surrogate.solids import Drum, Ellipsoid, SweptBox, distances_to
 from twin.errors import OptionError
 from twin.geometry.mesh import build_mesh, skin_surface
+from twin.objects.analytic import CompiledSolid, Plane
 from twin.store import write_text, writes
+from twin.types import FloatArray
 
+MM = 1e3
+"""Millimetres of a MuJoCo model's unit of length, the metre."""
+FILLET_MM = 0.45
+"""Radius of the rounded edges of boxes and cylinders. The surrogate was trained on no sharper edges."""
+LEAST_MM = 4.0
+"""Least radius of curvature of balls, capsules, cylinders and ellipsoids, because the nodes of the skin are 2.2 mm apart."""
+MESH_OFF_MM = 0.4
+"""Largest distance of a mesh's surface from the primitive that replaces it. Rounding takes 0.33 mm off the corner of a box."""
+SAMPLES = 2000
+Solid = tuple[CompiledSolid, FloatArray]
+"""A solid, and its pose (4, 4) in the frame of its geom, mm."""
 HOUSING_MM, WALL_MM, MASS_KG = 30.0, 1.0, 0.12
 """Length of the housing behind the skin's rim, how far it stands out beside the skin, and the mass of the whole sensor. They are those of a
 usual TacTip; a specification does not contain them."""
@@ -42,24 +58,13 @@ def housing_m(sensor: SensorSpec, length_mm: float = HOUSING_MM) -> tuple[float,
 def sensor_part(sensor: SensorSpec, *, length_mm: float = HOUSING_MM, mass_kg: float = MASS_KG) -> mujoco.MjSpec:
     """A sensor as MJCF: a body ``tactip`` with drawn skin, colliding housing, and the site ``tactip`` in the sensor's frame."""
     radius, length, origin = housing_m(sensor, length_mm)
-    skin, spec = skin_mesh(sensor), mujoco.MjSpec()
+    skin, spec, kinds = skin_mesh(sensor), mujoco.MjSpec(), mujoco.mjtGeom
     spec.modelname = sensor.name
     spec.add_mesh(name="skin", uservert=skin.vertices.ravel(), userface=skin.faces.ravel().astype(np.int32))
-    body = spec.worldbody.add_body(name="tactip")
-    middle = [0.0, 0.0, length / 2]
-    body.add_geom(
-        name="housing", type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[radius, length / 2, 0], pos=middle, mass=mass_kg, rgba=[0.2, 0.2, 0.2, 1]
-    )
-    body.add_geom(
-        name="skin",
-        type=mujoco.mjtGeom.mjGEOM_MESH,
-        meshname="skin",
-        pos=[0, 0, origin],
-        contype=0,
-        conaffinity=0,
-        mass=0,
-        rgba=[0.1, 0.1, 0.1, 1],
-    )
+    body, size = spec.worldbody.add_body(name="tactip"), [radius, length / 2, 0]
+    body.add_geom(name="housing", type=kinds.mjGEOM_CYLINDER, size=size, pos=[0, 0, length / 2], mass=mass_kg, rgba=[0.2, 0.2, 0.2, 1])
+    drawn = {"contype": 0, "conaffinity": 0, "mass": 0}
+    body.add_geom(name="skin", type=kinds.mjGEOM_MESH, meshname="skin", pos=[0, 0, origin], rgba=[0.1, 0.1, 0.1, 1], **drawn)
     body.add_site(name="tactip", pos=[0, 0, origin])
     return spec
 
@@ -122,25 +127,106 @@ def write_urdf(sensor: SensorSpec, out: Path, *, length_mm: float = HOUSING_MM, 
     skin_mesh(sensor).export(out / SKIN_FILE)
     across, along = mass_kg * (3 * radius**2 + length**2) / 12, mass_kg * radius**2 / 2
     robot = ElementTree.Element("robot", name=sensor.name)
-    link = ElementTree.SubElement(robot, "link", name="tactip")
-    for kind, place, shape in (
-        ("visual", origin, ("mesh", {"filename": SKIN_FILE})),
-        ("visual", length / 2, ("cylinder", {"radius": f"{radius:.6g}", "length": f"{length:.6g}"})),
-        ("collision", length / 2, ("cylinder", {"radius": f"{radius:.6g}", "length": f"{length:.6g}"})),
-        ("inertial", length / 2, None),
-    ):
-        part = ElementTree.SubElement(link, kind)
-        ElementTree.SubElement(part, "origin", xyz=f"0 0 {place:.6g}", rpy="0 0 0")
-        if shape is not None:
-            ElementTree.SubElement(ElementTree.SubElement(part, "geometry"), shape[0], shape[1])
-            continue
-        ElementTree.SubElement(part, "mass", value=f"{mass_kg:.6g}")
-        diagonal = {"ixx": across, "iyy": across, "izz": along, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0}
-        ElementTree.SubElement(part, "inertia", {name: f"{value:.6g}" for name, value in diagonal.items()})
-    ElementTree.SubElement(robot, "link", name="tactip_sensor")
-    joint = ElementTree.SubElement(robot, "joint", name="tactip_mount", type="fixed")
-    ElementTree.SubElement(joint, "parent", link="tactip")
-    ElementTree.SubElement(joint, "child", link="tactip_sensor")
-    ElementTree.SubElement(joint, "origin", xyz=f"0 0 {origin:.6g}", rpy="0 0 0")
+
+    def add(parent: ElementTree.Element, kind: str, *, at_m: float | None = None, **values: str | float) -> ElementTree.Element:
+        """Add an element with values, and its place along z as an element in it."""
+        texts = {key: value if isinstance(value, str) else f"{value:.6g}" for key, value in values.items()}
+        part = ElementTree.SubElement(parent, kind, texts)
+        if at_m is not None:
+            add(part, "origin", xyz=f"0 0 {at_m:.6g}", rpy="0 0 0")
+        return part
+
+    link = add(robot, "link", name="tactip")
+    add(add(add(link, "visual", at_m=origin), "geometry"), "mesh", filename=SKIN_FILE)
+    for kind in ("visual", "collision"):
+        add(add(add(link, kind, at_m=length / 2), "geometry"), "cylinder", radius=radius, length=length)
+    inertial = add(link, "inertial", at_m=length / 2)
+    add(inertial, "mass", value=mass_kg)
+    add(inertial, "inertia", ixx=across, iyy=across, izz=along, ixy=0.0, ixz=0.0, iyz=0.0)
+    add(robot, "link", name="tactip_sensor")
+    joint = add(robot, "joint", name="tactip_mount", type="fixed")
+    add(joint, "parent", link="tactip")
+    add(joint, "child", link="tactip_sensor")
+    add(joint, "origin", xyz=f"0 0 {origin:.6g}", rpy="0 0 0")
     ElementTree.indent(robot)
     return write_text(out / "sensor.urdf", ElementTree.tostring(robot, encoding="unicode") + "\n")
+
+
+def _refuse(name: str, reason: str) -> OptionError:
+    return OptionError(f"geom {name}: {reason}; leave it out by `touchable`, or replace it by a plane, ball, capsule, cylinder or box")
+
+
+def _require_curvature(name: str, radius_mm: float) -> float:
+    if radius_mm < LEAST_MM:
+        raise _refuse(name, f"a radius of curvature of {radius_mm:.2g} mm is too small for the surrogate (at least {LEAST_MM:g} mm)")
+    return radius_mm
+
+
+def _box(name: str, size: FloatArray) -> CompiledSolid:
+    fillet = min(FILLET_MM, *size)
+    x, y, z = (size - fillet).tolist()
+    return SweptBox(x, y, z, fillet)
+
+
+def _cylinder(name: str, size: FloatArray) -> CompiledSolid:
+    fillet = min(FILLET_MM, size[1])
+    return Drum(_require_curvature(name, size[0]) - fillet, size[1] - fillet, fillet)
+
+
+def _ellipsoid(name: str, size: FloatArray) -> CompiledSolid:
+    _require_curvature(name, size.min() ** 2 / size.max())
+    return Ellipsoid(*size.tolist())
+
+
+_KINDS: dict[int, Callable[[str, FloatArray], CompiledSolid]] = {
+    mujoco.mjtGeom.mjGEOM_PLANE: lambda name, size: Plane(),
+    mujoco.mjtGeom.mjGEOM_SPHERE: lambda name, size: SweptBox(0.0, 0.0, 0.0, _require_curvature(name, size[0])),
+    mujoco.mjtGeom.mjGEOM_CAPSULE: lambda name, size: SweptBox(0.0, 0.0, size[1], _require_curvature(name, size[0])),
+    mujoco.mjtGeom.mjGEOM_CYLINDER: _cylinder,
+    mujoco.mjtGeom.mjGEOM_BOX: _box,
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID: _ellipsoid,
+}
+"""How each type of geom becomes a solid, from its name and its sizes in mm."""
+
+
+def solid_of(model: mujoco.MjModel, geom: int) -> Solid:
+    """The solid of a geom.
+
+    Raises
+    ------
+    OptionError
+        The geom is of a type that no skin can be pressed against, is too sharp, or is a mesh that no primitive replaces.
+    """
+    name, kind, size, pose = model.geom(geom).name or str(geom), int(model.geom_type[geom]), MM * model.geom_size[geom], np.eye(4)
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+        return _of_mesh(model, geom, name)
+    if kind not in _KINDS:
+        raise _refuse(name, f"a geom of type {mujoco.mjtGeom(kind).name.removeprefix('mjGEOM_').lower()} can't be touched")
+    if kind == mujoco.mjtGeom.mjGEOM_PLANE:
+        pose[:3, :3] = np.diag([1.0, -1.0, -1.0])  # z points out of MuJoCo's plane, and into the twin's
+    return _KINDS[kind](name, size), pose
+
+
+def _of_mesh(model: mujoco.MjModel, geom: int, name: str) -> Solid:
+    """The box, cylinder or ball that is nearest to a mesh."""
+    number = int(model.geom_dataid[geom])
+    at, count = model.mesh_vertadr[number], model.mesh_vertnum[number]
+    faces = model.mesh_face[model.mesh_faceadr[number] :][: model.mesh_facenum[number]]
+    mesh = trimesh.Trimesh(MM * model.mesh_vert[at : at + count], faces)
+    points, _ = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)
+    points = np.concatenate([points, mesh.vertices])
+    box, drum, ball = mesh.bounding_box_oriented.primitive, mesh.bounding_cylinder.primitive, mesh.bounding_sphere.primitive
+    kinds, found = mujoco.mjtGeom, []
+    for kind, size, pose in (
+        (kinds.mjGEOM_BOX, box.extents / 2, np.asarray(box.transform)),
+        (kinds.mjGEOM_CYLINDER, np.array([drum.radius, drum.height / 2]), np.asarray(drum.transform)),
+        (kinds.mjGEOM_SPHERE, np.array([ball.radius]), trimesh.transformations.translation_matrix(ball.center)),
+    ):
+        with suppress(OptionError):  # its radius of curvature is too small
+            thing = _KINDS[kind](name, size)
+            inside = (points - pose[:3, 3]) @ pose[:3, :3]
+            found.append((float(np.abs(distances_to(inside, thing.kind, np.array(thing.sizes))[0]).max()), thing, pose))
+    off, thing, pose = min(found, key=lambda each: each[0])
+    if off > MESH_OFF_MM:
+        raise _refuse(name, f"its mesh is {off:.2f} mm off the nearest box, cylinder or ball (at most {MESH_OFF_MM:g} mm)")
+    return thing, pose

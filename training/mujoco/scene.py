@@ -18,7 +18,7 @@ import numpy as np
 
 from scenes import SensorSpec, load_sensor
 from training.environments.observe import Pictures, SensorView
-from training.mujoco.geoms import MESH_OFF_MM, MM, solid_of
+from training.mujoco.model import MESH_OFF_MM, MM, solid_of
 from training.surrogate.contacts import SurrogateContacts
 from training.surrogate.model import surrogate_of
 from training.surrogate.solids import distances_to
@@ -120,9 +120,10 @@ class TactileScene:
         self.sensors = {site: load_sensor(each) if isinstance(each, str) else each for site, each in sensors.items()}
         self._site = np.array([_number_of(model, mujoco.mjtObj.mjOBJ_SITE, site) for site in self.sensors], int)
         self._body = model.site_bodyid[self._site]
-        geoms = _touchable(model) if touchable is None else [_number_of(model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in touchable]
-        of = [solid_of(model, geom) for geom in geoms]
-        self._geom = np.array(geoms, int)
+        geoms = [_number_of(model, mujoco.mjtObj.mjOBJ_GEOM, name) for name in touchable or ()]
+        if touchable is None:
+            geoms = np.flatnonzero(model.geom_contype | model.geom_conaffinity).tolist()
+        self._geom, of = np.array(geoms, int), [solid_of(model, geom) for geom in geoms]
         self._solid, self._pose = [each for each, _ in of], np.array([pose for _, pose in of]).reshape(-1, 4, 4)
         sizes = np.zeros((len(of), 4))
         for row, each in enumerate(self._solid):
@@ -138,7 +139,7 @@ class TactileScene:
         surrogate = [surrogate_of(each, (surrogates or {}).get(each.name)) for each in specs]
         self._contacts = [SurrogateContacts(*each, few=True) for each in zip(surrogate, specs, counts, strict=True)]
         self._radius = np.array([self._contacts[number].radius_mm for number in self._set])
-        self._views: dict[tuple[str, Form, Pictures], SensorView] = {}
+        self._views: dict[tuple[str, Pictures], SensorView] = {}
         self.reset()
 
     def reset(self) -> None:
@@ -207,21 +208,12 @@ class TactileScene:
         """The contact of a sensor at the beginning of the last step."""
         sensor = self._number(site)
         contacts, row, at, gap = self._contacts[self._set[sensor]], int(self._row[sensor]), int(self._at[sensor]), self._gap[sensor]
-        felt, spec = contacts.felt, self.sensors[site]
-        inside = np.flatnonzero(gap < 0)
-        caps = contacts.caps_mm(row).copy()
-        return TactileReading(
-            self._name(at) if at >= 0 and gap[at] < 0 else "",
-            self._wrench[sensor, :3].copy(),
-            self._wrench[sensor, 3:].copy(),
-            caps,
-            project_in_form(spec, self.form(site), caps),
-            max(float(-gap[at]), 0.0) if at >= 0 else 0.0,
-            float(felt.area_mm2[row]),
-            float(felt.slip[row]),
-            felt.lost[row],
-            tuple(self._name(each) for each in inside.tolist() if each != at),
-        )
+        felt, caps, wrench = contacts.felt, contacts.caps_mm(row).copy(), self._wrench[sensor].copy()
+        depth_mm = max(float(-gap[at]), 0.0) if at >= 0 else 0.0
+        touched, beside = self._name(at) if depth_mm else "", [self._name(each) for each in np.flatnonzero(gap < 0).tolist() if each != at]
+        pins_px = project_in_form(self.sensors[site], self.form(site), caps)
+        area_mm2, slip = float(felt.area_mm2[row]), float(felt.slip[row])
+        return TactileReading(touched, wrench[:3], wrench[3:], caps, pins_px, depth_mm, area_mm2, slip, felt.lost[row], tuple(beside))
 
     def form(self, site: str) -> Form:
         """Form of a sensor's frames: that of its recordings, or raw frames of the camera."""
@@ -245,10 +237,9 @@ class TactileScene:
         return self.pipeline(site, pictures=pictures)(self.frame(site, pictures=pictures, seed=seed))
 
     def _view(self, site: str, pictures: Pictures) -> SensorView:
-        key = site, self.form(site), pictures
-        if key not in self._views:
-            self._views[key] = SensorView(self.sensors[site], key[1], pictures)
-        return self._views[key]
+        if (site, pictures) not in self._views:
+            self._views[site, pictures] = SensorView(self.sensors[site], self.form(site), pictures)
+        return self._views[site, pictures]
 
     def _number(self, site: str) -> int:
         if site not in self.sensors:
@@ -262,14 +253,8 @@ class TactileScene:
 def _number_of(model: mujoco.MjModel, kind: Any, name: str) -> int:
     number = mujoco.mj_name2id(model, kind, name)
     if number < 0:
-        what = mujoco.mju_type2Str(kind)
-        raise OptionError(f"the model has no {what} {name!r}")
+        raise OptionError(f"the model has no {mujoco.mju_type2Str(kind)} {name!r}")
     return int(number)
-
-
-def _touchable(model: mujoco.MjModel) -> list[int]:
-    """The geoms that collide with others."""
-    return np.flatnonzero(model.geom_contype | model.geom_conaffinity).tolist()
 
 
 @compiled()
@@ -304,10 +289,7 @@ def _gaps(poses: Arrays, solids: Arrays, radius: FloatArray, gap: FloatArray, no
         place, turn = _pose_of(site_xpos, site_xmat, sites[s])
         for g in range(len(geoms)):
             gap[s, g] = np.inf
-            off = 0.0
-            for axis in range(3):
-                off += (place[axis] - MM * geom_xpos[geoms[g], axis]) ** 2
-            if own[s, g] or off > (bound[g] + radius[s] + NEAR_MM) ** 2:
+            if own[s, g] or ((place - MM * geom_xpos[geoms[g]]) ** 2).sum() > (bound[g] + radius[s] + NEAR_MM) ** 2:
                 continue
             solid_place, solid_turn = _solid_at(geom_xpos, geom_xmat, geoms[g], pose[g])
             for axis in range(3):
@@ -349,7 +331,7 @@ def _push(poses: Arrays, at: IntArray, bodies: Arrays, contacts: Arrays, loss: f
     body_of, body, middle = bodies
     gap, before, normal, lost, solved = contacts
     wrench[:] = 0.0
-    force, torque, lever = np.empty(3), np.empty(3), np.empty(3)
+    force, torque = np.empty(3), np.empty(3)
     for s in range(len(at)):
         if at[s] < 0:
             continue
@@ -361,14 +343,12 @@ def _push(poses: Arrays, at: IntArray, bodies: Arrays, contacts: Arrays, loss: f
             for i in range(3):
                 wrench[s, i] = -size * (STOP_RETURNS if faster < 0 else 1.0) * (turn[:, i] * normal[s, at[s]]).sum()
         else:
-            for i in range(6):
-                wrench[s, i] = solved[s, i] * min(max(1.0 + loss * faster, 0.0), MOST_GROWTH)
+            wrench[s] = solved[s, :6] * min(max(1.0 + loss * faster, 0.0), MOST_GROWTH)
         for i in range(3):
             force[i], torque[i] = (turn[i] * wrench[s, :3]).sum(), (turn[i] * wrench[s, 3:]).sum()
         for side in range(2):
             part, sign = body[s] if side else body_of[geoms[at[s]]], 1.0 - 2.0 * side
-            for i in range(3):
-                lever[i] = place[i] - MM * middle[part, i]
+            lever = place - MM * middle[part]
             for i in range(3):
                 j, k = (i + 1) % 3, (i + 2) % 3
                 applied[part, i] += sign * force[i]

@@ -1,4 +1,16 @@
-"""What the environments in MuJoCo scenes have in common: two sensors on a gripper, kinds of observation, and pictures."""
+"""The environments in MuJoCo scenes, and what they have in common: two sensors on a gripper, kinds of observation, and pictures.
+
+``tactip/GraspLift-v0``: hold an object of unknown mass and friction in a parallel gripper with two TacTips.
+
+The hand moves by itself: it waits for ``GRIP_S`` with the fingers lightly closed, lifts the object, holds it, and sets it down. The agent
+commands the grip. The object breaks above a force that is ``CRUSH`` times the least grip that holds it. So no constant grip serves: the
+agent has to feel the load and the beginning slip.
+
+``tactip/PegInsert-v0``: insert a peg, which a gripper holds between two TacTips, into a hole that is 0.5 mm wider all around.
+
+The hole is up to ``OFF_MM`` beside the peg's tip, and the peg is tilted by up to ``TILTED_DEG`` in the grip. Neither is observed: the agent
+has to feel where the peg drops, and how it wedges.
+"""
 
 import math
 from collections.abc import Sequence
@@ -10,14 +22,39 @@ import numpy as np
 from gymnasium import spaces
 
 from scenes import load_sensor
-from training.environments.grasp import PERIOD_S, as_observation, in_spacings, with_change
-from training.mujoco.model import load_scene
+from training.environments.grasp import PERIOD_S, STEPS, TOUCHING_MM, GraspHand, as_observation, in_spacings, with_change
+from training.mujoco.model import MM, load_scene
 from training.mujoco.scene import TactileReading, TactileScene
 from twin.errors import OptionError
 from twin.types import FloatArray, ImageArray
 
 Touch = Literal["pins", "wrench", "none"]
 TOUCHES: tuple[str, ...] = get_args(Touch)
+MASS_KG, FRICTION = (0.05, 0.3), (0.3, 0.8)
+"""Ranges of mass and friction."""
+LEAST_N = 0.32, 2.0
+"""Range of the least grip. The skin is too soft for more."""
+CRUSH, WANTED = 2.0, 1.4
+"""Multiples of the least grip: at which the object breaks, and which earns most."""
+FALLEN_MM = 12.0
+"""Distance by which the object may sink in the grip. The skin alone gives way by up to 6 mm."""
+STANDS_MM = 1.0
+"""Height below which the object counts as set down."""
+BONUS = 20.0
+"""Reward for an object that was set down."""
+PEG_STEPS = 400
+OFF_MM, TILTED_DEG = 5.0, 5.0
+GRIP_MM = 24.0
+"""Travel of each finger. The grip is some 2.5 N."""
+STEP_MM, STEP_DEG = (1.0, 1.0, 1.0), 0.5
+"""Motion of the hand by an action of 1."""
+ABOVE_MM, TOP_MM, TIP_MM, DEEP_MM = 3.0, 40.0, 56.0, 25.0
+"""Height of the tip above the hole's rim at the start, height of the rim, distance of the tip from the handle's middle, and the depth that
+counts as inserted."""
+SLIPPED_MM, SLIPPED_DEG = 15.0, 20.0
+"""Motions of the peg in the grip from which on it counts as lost."""
+NEAR_MM, NEAR_DEG = 2.0, 2.0
+"""Errors at which their terms of the reward are half."""
 
 
 class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
@@ -114,8 +151,8 @@ class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
         mujoco.mj_resetData(self._model, self.scene.data)
         self._touch: FloatArray | None = None
         for finger in ("left", "right"):
-            self.scene.data.joint(finger).qpos[0] = fingers_mm / 1e3
-        self.scene.data.ctrl[-1] = fingers_mm / 1e3
+            self.scene.data.joint(finger).qpos[0] = fingers_mm / MM
+        self.scene.data.ctrl[-1] = fingers_mm / MM
 
     def settle(self, seconds: float = PERIOD_S, targets: Sequence[float] | None = None) -> None:
         """Let time pass, in which the actuators' targets change evenly to new ones, and feel."""
@@ -148,3 +185,111 @@ class GripperTask(gymnasium.Env[dict[str, FloatArray], FloatArray]):
         """Close the renderer."""
         if self._renderer is not None:
             self._renderer.close()
+
+
+class GraspLift(GripperTask):
+    """Hold while the hand lifts and lowers. Action: closing motion of the fingers, -1 to 1. See ``GripperTask``."""
+
+    world, held, shape = "gripper", "block", (3, 1)
+    timestep_s = 0.005
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, FloatArray], dict[str, Any]]:
+        """Begin an episode; ``options`` can give ``mass_kg`` and ``friction``.
+
+        All ratios of least grips are equally probable; mass and friction are drawn from those that need the drawn grip.
+        """
+        self.require_choices(options, 0.0, mass_kg=(), friction=())
+        super().reset(seed=seed)
+        least_n = float(np.exp(self.np_random.uniform(*np.log(LEAST_N))))
+        friction = self.np_random.uniform(*np.clip(np.array(MASS_KG) * 9.81 / (2 * least_n), *FRICTION))
+        drawn = {"mass_kg": 2 * friction * least_n / 9.81, "friction": friction} | (options or {})
+        mass, friction = float(drawn["mass_kg"]), float(drawn["friction"])
+        self.least_n = mass * 9.81 / (2 * friction)
+        model, data = self._model, self.scene.data
+        model.body_mass[self._object], model.body_inertia[self._object] = mass, mass * self._inertia
+        model.geom_friction[self._geom, 0] = friction
+        self._hand = GraspHand()
+        self.begin(TOUCHING_MM)
+        mujoco.mj_forward(model, data)
+        self.scene.reset()
+        self.settle()
+        self._from_mm = MM * float(data.xpos[self._object, 2])
+        return self._look(), {"mass_kg": mass, "friction": friction}
+
+    def step(self, action: FloatArray) -> tuple[dict[str, FloatArray], float, bool, bool, dict[str, Any]]:
+        """Move fingers and hand; see gymnasium. The reward of a step is at most 1, and 0 where the episode fails."""
+        closing = self.as_action(action)[0]
+        self._hand.move(closing)
+        self.settle(targets=(self._hand.hand_mm / MM, self._hand.fingers_mm / MM))
+        seen, grip_n, height = self._look(), self.grip_n(), self.height_mm()
+        crushed, dropped = grip_n > CRUSH * self.least_n, self._hand.hand_mm - height > FALLEN_MM
+        over, failed = self._hand.done == STEPS, crushed or dropped
+        solved = over and not failed and height < STANDS_MM
+        ratio = max(grip_n, 1e-3) / (WANTED * self.least_n)
+        terms = {"grip": 0.0 if failed else min(ratio, 1 / ratio), "set_down": BONUS * solved}
+        info = {"is_success": solved, "grip_n": grip_n, "height_mm": height, "crushed": crushed, "dropped": dropped, "terms": terms}
+        return seen, sum(terms.values()), failed or over, False, info
+
+    def height_mm(self) -> float:
+        """Height of the object above its place at the start."""
+        return MM * float(self.scene.data.xpos[self._object, 2]) - self._from_mm
+
+    def grip_n(self) -> float:
+        """The smaller of both fingers' forces along their axes, N."""
+        return float(min(each.force_n[2] for each in self.felt))
+
+    def _look(self) -> dict[str, FloatArray]:
+        return self.look(self._hand.state())
+
+
+class PegInsert(GripperTask):
+    """Insert a peg. Actions: motion of the hand along x, y, z, and its tilt about x, -1 to 1. See ``GripperTask``."""
+
+    world, held, shape = "peg", "handle", (5, 4)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, FloatArray], dict[str, Any]]:
+        """Begin an episode; ``options`` can give ``off_mm`` (x, y) and ``tilt_deg``."""
+        self.require_choices(options, off_mm=(2,), tilt_deg=())
+        super().reset(seed=seed)
+        angle, off = self.np_random.uniform(0.0, 2 * np.pi), OFF_MM * np.sqrt(self.np_random.uniform())
+        given = {"off_mm": off * np.array([np.cos(angle), np.sin(angle)]), "tilt_deg": self.np_random.uniform(-TILTED_DEG, TILTED_DEG)}
+        given |= options or {}
+        model, data = self._model, self.scene.data
+        tilt = np.radians(float(given["tilt_deg"]))
+        self._hole_mm = np.asarray(given["off_mm"], float) + [0.0, TIP_MM * np.sin(tilt)]
+        model.body("hole").pos[:2] = self._hole_mm / MM
+        self.begin(GRIP_MM)
+        self.hand, self._done = np.array([0.0, 0.0, ABOVE_MM + TOP_MM + TIP_MM - 100.0, 0.0]), 0
+        data.joint("z").qpos[0] = self.hand[2] / MM
+        data.joint("peg").qpos[2:5] = 0.1 + self.hand[2] / MM, np.cos(tilt / 2), np.sin(tilt / 2)
+        self._drive()
+        mujoco.mj_forward(model, data)
+        self.scene.reset()
+        self.settle(0.1)
+        return self._look(), given
+
+    def step(self, action: FloatArray) -> tuple[dict[str, FloatArray], float, bool, bool, dict[str, Any]]:
+        """Move the hand; see gymnasium. The reward of a step is at most 1, and 0 where the episode fails."""
+        moved_to = self.as_action(action) * [*STEP_MM, STEP_DEG] + self.hand
+        self.hand = np.clip(moved_to, [-15.0, -15.0, -50.0, -12.0], [15.0, 15.0, 20.0, 12.0])
+        self._drive()
+        self.settle()
+        self._done += 1
+        T = self.scene.data.xmat[self._object].reshape(3, 3)
+        at = MM * self.scene.data.xpos[self._object]
+        tip = at - TIP_MM * T[:, 2]
+        off, depth = float(np.linalg.norm(tip[:2] - self._hole_mm)), TOP_MM - float(tip[2])
+        tilt = float(np.degrees(np.arccos(min(T[2, 2], 1.0))))
+        moved = float(np.linalg.norm(at - self.hand[:3] - [0.0, 0.0, 100.0]))
+        failed, solved = moved > SLIPPED_MM or tilt > SLIPPED_DEG, depth >= DEEP_MM
+        sunk = float(np.clip(depth / DEEP_MM, 0, 1))
+        terms = {"off": 0.2 / (1 + off / NEAR_MM), "tilt": 0.1 / (1 + tilt / NEAR_DEG), "depth": 0.7 * sunk}
+        reward = 0.0 if failed else sum(terms.values()) + (PEG_STEPS - self._done) * float(solved)
+        info = {"is_success": solved, "off_mm": off, "depth_mm": depth, "tilt_deg": tilt, "slipped": failed, "terms": terms}
+        return self._look(), reward, failed or solved, self._done >= PEG_STEPS, info
+
+    def _drive(self) -> None:
+        self.scene.data.ctrl[:4] = *self.hand[:3] / MM, np.radians(self.hand[3])
+
+    def _look(self) -> dict[str, FloatArray]:
+        return self.look([*(self.hand[:3] / 10.0), self.hand[3] / 5.0, self._done / PEG_STEPS])

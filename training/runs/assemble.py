@@ -76,7 +76,12 @@ class Ensemble:
             chosen = self.kernel_labels
             also = self._kernels_say(self.modes(inputs, rows))
             mean[:, chosen] = self.blend[chosen] * also + (1 - self.blend[chosen]) * mean[:, chosen]
-        return mean, *_scale_and_move(outs)
+        scale, executed = np.ones(mean.shape), np.full(len(mean), np.nan)
+        if "log_scale" in outs[0]:
+            scale = np.exp(np.mean([out["log_scale"].clamp(-8, 4).double().numpy() for out in outs], axis=0))
+        if "executed" in outs[0]:
+            executed = np.mean([torch.sigmoid(out["executed"].double()).numpy() for out in outs], axis=0)
+        return mean, scale, executed
 
     def modes(self, inputs: Inputs, rows: torch.Tensor) -> Modes:
         """The inputs of the Gaussian processes for some rows (B,): the first network's modes."""
@@ -111,25 +116,8 @@ class Ensemble:
         return (self.code.encode(labels) - self.shift) / self.scale
 
 
-def _scale_and_move(outs: list[dict[str, torch.Tensor]]) -> tuple[np.ndarray, np.ndarray]:
-    shape = outs[0]["mean"].shape
-    scale = np.ones(shape)
-    if "log_scale" in outs[0]:
-        scale = np.exp(np.mean([out["log_scale"].clamp(-8, 4).double().numpy() for out in outs], axis=0))
-    executed = np.full(shape[0], np.nan)
-    if "executed" in outs[0]:
-        executed = np.mean([torch.sigmoid(out["executed"].double()).numpy() for out in outs], axis=0)
-    return scale, executed
-
-
 def calibrate(
-    config: RunConfig,
-    data: Dataset,
-    prepared: Prepared,
-    train: np.ndarray,
-    networks: list[dict],
-    code: LabelCode,
-    scaling: tuple[np.ndarray, np.ndarray],
+    config: RunConfig, data: Dataset, prepared: Prepared, train: np.ndarray, networks: list[dict], code: LabelCode, scaling: tuple
 ) -> dict:
     """Fit the Gaussian processes if the recipe has them, the weights of the average, and the intervals.
 
@@ -153,9 +141,8 @@ def calibrate(
     (shift, scale), model, kernel = scaling, model_named(config.model), config.recipe.kernel
     learnt = training_labels(data, config)
     y = (code.encode(learnt) - shift) / scale
-    k, e, owner = learnt.shape[1], y.shape[1], code.label_of
-    helps = [name in config.helpers for name in data.targets.names]
-    main = np.array([j for j in range(e) if not helps[owner[j]]], int)  # numbers that the processes estimate
+    k, e = learnt.shape[1], y.shape[1]
+    main = np.flatnonzero(~np.isin(data.targets.names, config.helpers)[code.label_of])  # numbers that the processes estimate
     content: dict = {"networks": [network["weights"] for network in networks], "kernels": [], "shift": shift, "scale": scale}
     content |= {"blend": np.zeros(e), "quantile": np.ones(k), "raw_quantile": np.ones((2, k)), "kernel_labels": main.tolist()}
     content["circular"] = np.array(code.circular, np.int64)

@@ -157,15 +157,14 @@ class Kernel:
         return self.between(placed, placed) + self._library.diag(noises**2 + JITTER)
 
     def logs(self) -> np.ndarray:
-        """Logarithms of all parameters in one row: lengths, sizes, noises, and the reach if a term has one."""
-        return np.log(np.concatenate([self.lengths, self.sizes, self.noises, [self.reach] if self._reaches else []]))
+        """Logarithms of all parameters in one row: lengths, sizes, noises, reach."""
+        return np.log(np.concatenate([self.lengths, self.sizes, self.noises, [self.reach]]))
 
     def with_logs(self, logs: np.ndarray | torch.Tensor) -> "Kernel":
         """The kernel with other parameters, given in the order of ``logs``; they are tensors if these are."""
         values: Any = logs.exp() if isinstance(logs, torch.Tensor) else np.exp(logs)
-        ends = np.cumsum([len(self.lengths), len(self.sizes), len(self.noises)])
-        reach = values[-1] if self._reaches else self.reach
-        return replace(self, lengths=values[: ends[0]], sizes=values[ends[0] : ends[1]], noises=values[ends[1] : ends[2]], reach=reach)
+        ends = np.cumsum([len(self.lengths), len(self.sizes)])
+        return replace(self, lengths=values[: ends[0]], sizes=values[ends[0] : ends[1]], noises=values[ends[1] : -1], reach=values[-1])
 
     def log_likelihood(self, points: Points, label: np.ndarray) -> torch.Tensor:
         """Log marginal likelihood of a label (M,) with mean 0.
@@ -183,10 +182,6 @@ class Kernel:
     def _library(self) -> Any:
         """PyTorch for parameters that are tensors, which have derivatives; NumPy for arrays, which are faster for single frames."""
         return torch if isinstance(self.lengths, torch.Tensor) else np
-
-    @property
-    def _reaches(self) -> bool:
-        return any(term.reaches for term in self.terms)
 
 
 def climb_likelihood(start: Kernel, points: Points, label: np.ndarray) -> Kernel:

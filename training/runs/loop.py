@@ -25,6 +25,8 @@ SCALE_LOSS = 0.05
 EXECUTED_LOSS = 0.05
 # Parts of a training that have a state of their own.
 STATEFUL = ("network", "optimiser", "plateau")
+# Attributes of a training that are its state, too.
+STATE = ("averaged", "best_weights", "steps", "epochs_done", "best", "since_best", "curves")
 
 
 @dataclass(frozen=True)
@@ -81,11 +83,7 @@ class Loop:
         recipe = self.recipe
         parameters = list(self.network.parameters())
         self.device = device_of(self.network)
-        self.optimiser: torch.optim.Optimizer
-        if recipe.decay:
-            self.optimiser = torch.optim.AdamW(parameters, lr=recipe.rate, weight_decay=recipe.decay)
-        else:
-            self.optimiser = torch.optim.Adam(parameters, lr=recipe.rate)
+        self.optimiser = torch.optim.AdamW(parameters, lr=recipe.rate, weight_decay=recipe.decay)
         self.plateau = torch.optim.lr_scheduler.ReduceLROnPlateau(self.optimiser, factor=0.5, patience=PLATEAU_PATIENCE)
         self.generator = torch.Generator().manual_seed(self.seed)
         self.averaged = [p.detach().clone() for p in parameters]
@@ -133,9 +131,9 @@ class Loop:
 
     def state(self) -> dict:
         """Everything that is needed to continue the training."""
-        keys = ("averaged", "best_weights", "steps", "epochs_done", "best", "since_best", "curves")
         parts = {key: getattr(self, key).state_dict() for key in STATEFUL}
-        return {key: getattr(self, key) for key in keys} | parts | {"generator": self.generator.get_state(), "torch": torch.get_rng_state()}
+        parts |= {"generator": self.generator.get_state(), "torch": torch.get_rng_state()}
+        return {key: getattr(self, key) for key in STATE} | parts
 
     def load(self, state: dict) -> None:
         """Continue from a state."""
@@ -143,19 +141,18 @@ class Loop:
             getattr(self, key).load_state_dict(state[key])
         self.generator.set_state(state["generator"])
         torch.set_rng_state(state["torch"])
-        self.averaged = [value.to(self.device) for value in state["averaged"]]
-        for key in ("best_weights", "steps", "epochs_done", "best", "since_best", "curves"):
+        for key in STATE:
             setattr(self, key, state[key])
+        self.averaged = [value.to(self.device) for value in self.averaged]
 
     def _step(self, chosen: torch.Tensor) -> float:
         if self.recipe.schedule == "cosine":
             along = self.steps / (self.recipe.epochs * self.steps_of_epoch)
             for group in self.optimiser.param_groups:
                 group["lr"] = self.recipe.rate * min(1.0, (self.steps + 1) / RISE_STEPS) * 0.5 * (1 + math.cos(math.pi * along))
-        out = self.network(*(part.to(self.device) for part in self.rows.inputs.batch(chosen)))
-        labels, executed, weight = (
-            part.to(self.device) for part in (self.rows.labels[chosen], self.rows.executed[chosen], self.rows.weight)
-        )
+        rows = self.rows
+        out = self.network(*(part.to(self.device) for part in rows.inputs.batch(chosen)))
+        labels, executed, weight = (part.to(self.device) for part in (rows.labels[chosen], rows.executed[chosen], rows.weight))
         loss = row_loss(out, labels, executed, weight, self.recipe.loss)
         if (penalty := self.penalty(self.network)) is not None:
             loss = loss + penalty

@@ -24,8 +24,7 @@ from twin.camera.capture import CHROMA_RANGE, LUMA_RANGE, before_stream, expose,
 from twin.camera.projection import Disc, lens_disc
 from twin.camera.residual import LEAK, LEVELS, MIDDLE, MOST_LEVELS, STEEPNESS, differences, with_residual
 from twin.errors import FrameError, format_count
-from twin.evaluation.pictures.aligned import with_changes
-from twin.evaluation.pictures.frames import read_real
+from twin.evaluation.pictures.aligned import read_real, with_changes
 from twin.evaluation.pictures.images import compare_images
 from twin.frames.recording import BadFrame
 from twin.mechanics.skin_fit import SkinFit
@@ -98,19 +97,13 @@ class TaughtResidual:
     def lines(self) -> list[str]:
         """The result as lines of text."""
         lines = [f"refused {each['image_name']}: {each['reason']}" for each in self.refused]
-        told = [
-            f"two-sample accuracy, {name} evaluate: {self.before[name].text()} -> {self.after[name].text()}; "
-            f"of two halves of the real frames {self.real[name].text()}"
-            for name in self.before
-        ]
-        return [
-            *lines,
-            f"{format_count(self.frames, 'frames')}, each with a network that did not see it",
-            *told,
-            f"PSNR over the disc {self.psnr_db[0]:.2f} -> {self.psnr_db[1]:.2f} dB; "
-            f"pins moved by {self.shift_px[0]:.3f} px (median), {self.shift_px[1]:.3f} px (95 %)",
-            "the network is off: 'twin realism --residual' and 'twin dataset --residual' switch it on",
-        ]
+        lines.append(f"{format_count(self.frames, 'frames')}, each with a network that did not see it")
+        for name, before in self.before.items():
+            halves = f"of two halves of the real frames {self.real[name].text()}"
+            lines.append(f"two-sample accuracy, {name} evaluate: {before.text()} -> {self.after[name].text()}; {halves}")
+        moved = f"pins moved by {self.shift_px[0]:.3f} px (median), {self.shift_px[1]:.3f} px (95 %)"
+        lines.append(f"PSNR over the disc {self.psnr_db[0]:.2f} -> {self.psnr_db[1]:.2f} dB; {moved}")
+        return [*lines, "the network is off: 'twin realism --residual' and 'twin dataset --residual' switch it on"]
 
 
 @writes_file(".*.csv", ".*.uri")
@@ -147,7 +140,7 @@ def calibrate_residual(
             light.append(renderer.render(fit(each.pins_px), seed=done))
             step(done + 1, len(read.frames))
     real = [each.frame.image for each in read.frames]
-    plain = _shots(sensor, light)
+    plain = [expose(each, sensor.capture, np.random.default_rng(k)) for k, each in enumerate(light)]
     found = list(plain)
     halves = [np.arange(len(real))[k::2] for k in (0, 1)]
     for taught, unseen in (halves, halves[::-1]):
@@ -162,18 +155,12 @@ def calibrate_residual(
         before, after = (evaluate_classifiers(real, shown, disc.inside, progress=step) for shown in (plain, found))
     with stage(progress, "the same for halves of the real frames") as step:
         real_told = evaluate_halves(real, disc.inside, progress=step)
-    psnr = [
-        float(np.mean([compare_images(a, b, disc.inside).psnr_db for a, b in zip(real, shown, strict=True)])) for shown in (plain, found)
-    ]
+    pairs = (zip(real, shown, strict=True) for shown in (plain, found))
+    psnr_db = [float(np.mean([compare_images(*pair, disc.inside).psnr_db for pair in each])) for each in pairs]
+    shift_px = _shift_px(sensor, plain, found)
     spec = with_changes(sensor, response={"residual": residual.model_dump()})
     write_sensor(out, spec, f"With a residual network that was trained on {format_count(len(real), 'frames')} of {frames.name}.")
-    return TaughtResidual(
-        spec, len(real), before, after, real_told, (psnr[0], psnr[1]), _shift_px(sensor, plain, found), read.refused, [out]
-    )
-
-
-def _shots(sensor: SensorSpec, light: list[FloatArray]) -> list[ImageArray]:
-    return [expose(each, sensor.capture, np.random.default_rng(k)) for k, each in enumerate(light)]
+    return TaughtResidual(spec, len(real), before, after, real_told, (psnr_db[0], psnr_db[1]), shift_px, read.refused, [out])
 
 
 def _shift_px(sensor: SensorSpec, first: list[ImageArray], second: list[ImageArray]) -> tuple[float, float]:
@@ -207,16 +194,11 @@ class ResidualNetwork(nn.Module):
 
 
 def teach(
-    real: list[ImageArray],
-    light: list[FloatArray],
-    sensor: SensorSpec,
-    disc: Disc,
-    *,
-    steps: int = STEPS,
-    seed: int = 0,
-    progress: Step = unheard,
+    real: list[ImageArray], light: list[FloatArray], sensor: SensorSpec, disc: Disc, *, steps: int = STEPS, progress: Step = unheard
 ) -> ResidualSpec:
     """A residual network that was taught on real frames (H, W, 3) uint8 and the rendered light (H, W, 3) of the same states.
+
+    The same frames give the same network.
 
     Parameters
     ----------
@@ -224,15 +206,14 @@ def teach(
         Without a residual network; its response makes gray levels of the light.
     disc : Disc
         The lens disc, within which patches lie and the network acts.
-    steps, seed : int
-        The same seed gives the same network.
+    steps : int
     """
-    rng, corners = np.random.default_rng(seed), patch_corners(disc.inside)
+    rng, corners = np.random.default_rng(0), patch_corners(disc.inside)
     corners = corners[corners[:, 1] % 2 == 0]  # neighbouring columns share colour differences
     matrix = torch.from_numpy(differences(luma_weights(sensor.response.stream)))
     shown = torch.from_numpy(np.stack(real).astype(np.float32)).permute(0, 3, 1, 2)
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.manual_seed(0)
         network = ResidualNetwork()
         judges = [patch_network(), patch_network(), _fine_classifier()]
         their = [_optimizer(judge) for judge in judges]
@@ -240,9 +221,8 @@ def teach(
         kept = [weights.detach().clone() for weights in network.parameters()]
         for done in range(steps):
             if done % NOISE_ANEW == 0:
-                signal = _colours(
-                    torch.from_numpy(np.stack([before_stream(x, sensor.capture, rng) for x in light])).permute(0, 3, 1, 2), matrix
-                )
+                gray = np.stack([before_stream(x, sensor.capture, rng) for x in light])
+                signal = _colours(torch.from_numpy(gray).permute(0, 3, 1, 2), matrix)
             if done and done % ANEW == 0:
                 turn = done // ANEW % 2
                 judges[turn] = patch_network()

@@ -24,8 +24,7 @@ from training.errors import TrainingError
 from training.models import model_named
 from training.models.part import Prepared
 from training.runs.assemble import calibrate
-from training.runs.config import RunConfig, training_labels, training_rows
-from training.runs.identity import ASIDE, difference, frame_marks, identity_of
+from training.runs.config import ASIDE, RunConfig, difference, frame_marks, identity_of, training_labels, training_rows
 from training.runs.loop import Loop, TrainingRows, parameter_count
 from training.runs.run_files import CHECKPOINT, CONFIG, TENSORS, damage_error, read_config, read_tensors, write_tensors
 from twin.errors import ErrorsAs
@@ -54,7 +53,7 @@ class _Lesson:
     prepared: Prepared
     code: LabelCode
     scaled: torch.Tensor
-    scaling: tuple[np.ndarray, np.ndarray]
+    scaling: tuple
 
     def member(self, member: int, device: str) -> Loop:
         """The training of a network, from its beginning."""
@@ -116,7 +115,7 @@ def train_run(
     TrainingError
         ``out`` holds another run, there are too few frames, or ``max_minutes`` is not a valid time.
     """
-    started = monotonic()
+    started, out_of_time = monotonic(), False
     if max_minutes is not None and not max_minutes >= 0:  # also true for NaN, with which the training would never stop
         raise TrainingError(f"`max_minutes` {max_minutes}: give a time of 0 or more")
     data = data.in_order()
@@ -133,32 +132,30 @@ def train_run(
     state = _open_checkpoint(out, resolved)
     prepared = model_named(config.model).prepare(data, train)
     code = LabelCode(goes_round(data.targets.units, training_labels(data, config)[train]))
-    scaled, *scaling = scaled_labels(data, config, train, code)
-    lesson = _Lesson(out, resolved, config, data, train, prepared, code, scaled, (scaling[0], scaling[1]))
+    lesson = _Lesson(out, resolved, config, data, train, prepared, code, *scaled_labels(data, config, train, code))
     done: list = state["done"] if state else []
-    all_epochs = config.recipe.members * config.recipe.epochs
-    while len(done) < config.recipe.members:
+    members, epochs = config.recipe.members, config.recipe.epochs
+    while len(done) < members and not out_of_time:
         member = len(done)
         loop = lesson.member(member, device)
         if state and state["loop"] is not None:
             loop.load(state["loop"])
-        state, kept, out_of_time = None, monotonic(), False
-        while not loop.finished:
+        state, kept = None, monotonic()
+        while not loop.finished and not out_of_time:
             point = loop.epoch()
-            progress(member * config.recipe.epochs + point["epoch"], all_epochs, f"{point['held_out_error']:.4f}")
+            progress(member * epochs + point["epoch"], members * epochs, f"{point['held_out_error']:.4f}")
             out_of_time = max_minutes is not None and monotonic() - started > 60 * max_minutes
             if out_of_time or monotonic() - kept > KEEP_EVERY_S:
                 lesson.keep(done, loop)
                 kept = monotonic()
-            if out_of_time and not loop.finished:
-                lesson.assemble([*done, _collect_weights(loop)])
-                return False
+        if not loop.finished:
+            lesson.assemble([*done, _collect_weights(loop)])
+            return False
         done.append(_collect_weights(loop))
         lesson.keep(done, None)
-        if out_of_time and len(done) < config.recipe.members:
-            lesson.assemble(done)
-            return False
     lesson.assemble(done)
+    if len(done) < members:
+        return False
     (out / CHECKPOINT).unlink(missing_ok=True)
     return True
 
@@ -196,7 +193,7 @@ def resolve(config: RunConfig, data: Dataset, train: np.ndarray) -> dict:
     return found | ({"labelled": dict(config.labelled)} if config.labelled else {})
 
 
-def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray, code: LabelCode) -> tuple[torch.Tensor, np.ndarray, np.ndarray]:
+def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray, code: LabelCode) -> tuple[torch.Tensor, tuple]:
     """Labels (M, E) for the network, float32, and shift and scale (E,) for the code's numbers: ``number = shift + scale x``."""
     labels = code.encode(training_labels(data, config))
     known, k = labels[train], labels.shape[1]
@@ -209,7 +206,7 @@ def scaled_labels(data: Dataset, config: RunConfig, train: np.ndarray, code: Lab
     scale = np.where(scale > 0, scale, 1.0)
     pair = np.array(code.circular)[code.label_of]
     shift, scale = np.where(pair, 0.0, shift), np.where(pair, np.sqrt(0.5), scale)  # sine and cosine of a direction need a common scale
-    return torch.from_numpy(((labels - shift) / scale).astype(np.float32)), shift, scale
+    return torch.from_numpy(((labels - shift) / scale).astype(np.float32)), (shift, scale)
 
 
 def fold_rows(train: np.ndarray, seed: int, member: int, group: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

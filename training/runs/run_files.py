@@ -26,7 +26,7 @@ from scenes.load import explain_problems
 from scenes.sensor import SensorSpec
 from training.errors import TrainingError
 from training.models import model_named
-from training.runs.identity import ASIDE
+from training.runs.config import ASIDE
 from twin.errors import ErrorsAs
 from twin.pins import make_reference
 from twin.store import write_bytes, write_text, write_with, writes
@@ -133,7 +133,7 @@ def read_tensors(path: Path, remedy: str = AGAIN) -> dict[str, Any]:
             changed = file.testzip()
         if changed:
             raise zipfile.BadZipFile("a checksum is wrong")
-        content = torch.load(path, weights_only=True, map_location="cpu")
+        return dict(torch.load(path, weights_only=True, map_location="cpu"))
     except OSError as error:
         raise TrainingError(f"{path}: can't be read ({error.strerror or error}); {remedy}") from error
     except zipfile.BadZipFile as error:
@@ -142,9 +142,6 @@ def read_tensors(path: Path, remedy: str = AGAIN) -> dict[str, Any]:
         raise damage_error(path, "holds more than numbers, and is not loaded for that reason", remedy) from error
     except (RuntimeError, ValueError, KeyError, EOFError, TypeError, AttributeError, IndexError) as error:
         raise damage_error(path, "no file of weights", remedy) from error
-    if not isinstance(content, dict):
-        raise damage_error(path, "no file of weights", remedy)
-    return content
 
 
 def damage_error(path: Path, how: str, remedy: str = AGAIN) -> TrainingError:
@@ -209,15 +206,15 @@ def pack(run: Path, out: Path) -> int:
     kept[NETWORKS] = [model.pack(weights) for weights in content[NETWORKS]]
     if rows:
         kept |= {KERNELS: content[KERNELS], KERNEL_LABELS: torch.tensor(content[KERNEL_LABELS])}
-    arrays = _flat(kept)
-    of_processes = (f"{BESIDE}.", f"{KERNELS}.")
-    whole = {key for key, value in arrays.items() if value.size <= LARGE or value.dtype == np.int64 or key.startswith(of_processes)}
-    small = {key: value if key in whole else value.astype(np.float16) for key, value in arrays.items()}
+    small = {}
+    for key, value in _flat(kept).items():
+        whole = value.size <= LARGE or value.dtype == np.int64 or key.startswith((f"{BESIDE}.", f"{KERNELS}."))
+        small[key] = np.ascontiguousarray(value if whole else value.astype(np.float16))
     small["reference_px"] = content["reference_px"].numpy()  # in full precision, because the graph is made from it
-    weights = save({key: np.ascontiguousarray(value) for key, value in small.items()})
+    weights = save(small)
     write_bytes(out / WEIGHTS, weights)
     about = {key: value for key, value in config.items() if key not in ASIDE} | {SHA256: hashlib.sha256(weights).hexdigest()}
-    about |= {RECORDINGS: [Path(folder).name for folder in config.get("data", "").split(", ") if folder]}
+    about[RECORDINGS] = [Path(folder).name for folder in config.get("data", "").split(", ") if folder]
     write_text(out / CONFIG, json.dumps(about) + "\n")
     for name in BESIDE_FILES:
         if (run / name).is_file():

@@ -117,19 +117,16 @@ def load_models(
 
     Models that use a frame without contact take that of the ``source``; without one, its contacts determine the pins at rest.
     """
-    return {each.name: _at_rest(_load_estimator(each, sensor), source) for each in runs}
-
-
-def _load_estimator(run: Path, sensor: SensorSpec) -> "PoseEstimator":
     from training.estimate.estimator import PoseEstimator
 
-    estimator = PoseEstimator.load(run)
-    estimator.check(sensor, estimator.form)
-    return estimator
+    found = {run.name: PoseEstimator.load(run) for run in runs}
+    for estimator in found.values():
+        estimator.check(sensor, estimator.form)
+    return found if source is None else {name: _at_rest(estimator, source) for name, estimator in found.items()}
 
 
-def _at_rest(estimator: "PoseEstimator", source: RenderedSource | RealSource | None) -> "PoseEstimator":
-    if source is None or not estimator.counts_from_rest:
+def _at_rest(estimator: "PoseEstimator", source: RenderedSource | RealSource) -> "PoseEstimator":
+    if not estimator.counts_from_rest:
         return estimator
     recording, rest = source.spec.recording, source.rest_frame
     if rest is not None:

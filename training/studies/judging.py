@@ -21,7 +21,7 @@ from training.data.targets import ANGLE, DEPTH, TURN, Targets, limits_of
 from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.models.part import Prediction
-from training.runs.identity import rows_named
+from training.runs.config import rows_named
 from twin.estimate import readable_labels
 from twin.frames import open_recording
 from twin.progress import Step, unheard
@@ -217,15 +217,11 @@ def _draw(path: Path, made: Prediction, truth: np.ndarray, targets: Targets, lab
 Change = Callable[[np.ndarray, np.random.Generator, PoseEstimator], np.ndarray]
 
 
-def _similar(image: np.ndarray, *, scale: float = 1.0, turn_deg: float = 0.0, shift_px: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+def _similar(image: np.ndarray, *, scale: float = 1.0, turn_deg: float = 0.0, shift_px: float = 0.0, towards: float = 0.0) -> np.ndarray:
     height, width = image.shape[:2]
     matrix = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), turn_deg, scale)
-    matrix[:, 2] += np.array(shift_px)
+    matrix[:, 2] += shift_px * np.cos(towards), shift_px * np.sin(towards)
     return cv2.warpAffine(image, matrix, (width, height), flags=cv2.INTER_LINEAR)
-
-
-def _shift_image(image: np.ndarray, angle: float) -> np.ndarray:
-    return _similar(image, shift_px=(SHIFT_CHANGE_PX * np.cos(angle), SHIFT_CHANGE_PX * np.sin(angle)))
 
 
 def erase_pins(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstimator) -> np.ndarray:
@@ -244,7 +240,7 @@ def erase_pins(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstim
 # The changes. The sign, the direction and the pins are sampled at random.
 CHANGES: dict[str, Change] = {
     "1 % scale": lambda image, rng, _: _similar(image, scale=1 + SCALE_CHANGE * rng.choice([-1, 1])),
-    "2 px shift": lambda image, rng, _: _shift_image(image, rng.uniform(0, 2 * np.pi)),
+    "2 px shift": lambda image, rng, _: _similar(image, shift_px=SHIFT_CHANGE_PX, towards=rng.uniform(0, 2 * np.pi)),
     "1 deg turn": lambda image, rng, _: _similar(image, turn_deg=TURN_CHANGE_DEG * rng.choice([-1.0, 1.0])),
     "5 pins erased": erase_pins,
 }

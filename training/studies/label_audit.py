@@ -125,14 +125,11 @@ def _moves(audit: Audit, data: Dataset) -> dict:
     large = np.abs(_pose_and_move(data)[1]).max(axis=1) > LARGE_MOVE
     undone = audit.executed < 0.5
     second = np.sort(audit.chi2[:, :2], axis=1)
-    return {
-        "moves_not_executed": {"frames": int(undone.sum()), "of_large_moves": float(undone[large].mean()) if large.any() else None},
-        "undecided": int(((audit.executed > 0.05) & (audit.executed < 0.95)).sum()),
-        "median_chi2": {
-            "better_story": float(np.nanmedian(second[:, 0])),
-            "worse_story_large_moves": float(np.nanmedian(second[large, 1])) if large.any() else None,
-        },
-    }
+    moves = {"frames": int(undone.sum()), "of_large_moves": float(undone[large].mean()) if large.any() else None}
+    worse = float(np.nanmedian(second[large, 1])) if large.any() else None
+    chi2 = {"better_story": float(np.nanmedian(second[:, 0])), "worse_story_large_moves": worse}
+    undecided = int(((audit.executed > 0.05) & (audit.executed < 0.95)).sum())
+    return {"moves_not_executed": moves, "undecided": undecided, "median_chi2": chi2}
 
 
 def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[Path]:
@@ -156,7 +153,7 @@ def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[P
     page.table(_findings(summary), [Column("finding", "finding"), Column("value", "value", align="right")])
     page.section("Frames that stand out")
     page.table(
-        [{"finding": _title(key), "count": len(summary[key]), "frames": _some(summary[key])} for key in LISTS],
+        [{"finding": key.replace("_", " "), "count": len(summary[key]), "frames": _some(summary[key])} for key in LISTS],
         [Column("finding", "finding"), Column("count", "frames"), Column("frames", "which")],
     )
     for table in evidence[:1]:
@@ -174,25 +171,16 @@ def _write_evidence(out: Path, audit: Audit, data: Dataset, page: Page) -> list[
     return [write_table(out / "labels_corrected.csv", _label_rows(audit, data, labels)), chart]
 
 
-def _findings(summary: dict) -> list[dict]:
+def _findings(group: dict, within: str = "") -> list[dict]:
     """The findings that are numbers, one in each row. A finding within a group is named with the group's name first."""
     rows = []
-    for key, value in summary.items():
-        if key in LISTS or key in ("reader", "not_told"):
-            continue
-        parts = _flat(_title(key), value)
-        rows += [{"finding": name, "value": number(part)} for name, part in parts]
+    for key, value in group.items():
+        name = f"{within}{key.replace('_', ' ')}"
+        if isinstance(value, dict):
+            rows += _findings(value, f"{name}: ")
+        elif key not in (*LISTS, "reader", "not_told"):
+            rows.append({"finding": name, "value": number(value)})
     return rows
-
-
-def _flat(name: str, value: object) -> list[tuple[str, object]]:
-    if isinstance(value, dict):
-        return [found for key, part in value.items() for found in _flat(f"{name}: {_title(key)}", part)]
-    return [(name, value)]
-
-
-def _title(key: str) -> str:
-    return key.replace("_", " ")
 
 
 def _some(names: list[str]) -> str:

@@ -13,10 +13,10 @@ from training.data.two_sample import SMALL, TwoSample, accuracy_text, evaluate_c
 from twin.camera.projection import lens_disc
 from twin.errors import OptionError, format_count
 from twin.evaluation.pictures import report
+from twin.evaluation.pictures.aligned import FEW_LOST, read_real
 from twin.evaluation.pictures.compare import fixed_residual, statistics
 from twin.evaluation.pictures.compare import pin_aligned as align_pins
 from twin.evaluation.pictures.compare import pose_aligned as align_poses
-from twin.evaluation.pictures.frames import FEW_LOST, read_real
 from twin.optics.relief import without as plain_of
 from twin.progress import Progress, Step, silent, stage
 from twin.store import writes
@@ -43,18 +43,14 @@ class Realism(ReadableResult):
         worst = ", ".join(f"{name} {100 * value:.1f} %" for name, value in found["worst_relative_difference"].items())
         lines.append(f"largest difference in a radial bin: {worst}")
         lines += [f"{name}: real {pair['real']:.2f}, rendered {pair['rendered']:.2f}" for name, pair in found["scalars"].items()]
-        spots = found["spots"]
-        lines.append(
-            f"spectra differ by {found['spectrum_db']:.2f} dB; {spots['paired']} of {spots['real']} bright spots have a counterpart"
-        )
+        bright = "{paired} of {real} bright spots have a counterpart".format(**found["spots"])
+        lines.append(f"spectra differ by {found['spectrum_db']:.2f} dB; {bright}")
         lines.append(f"all pins found in {100 * metrics['pin_aligned']['exact_fraction']:.1f} % of the renders")
         for name, made in metrics["two_sample"].items():
             lines.append(f"two-sample accuracy, {name}: {accuracy_text(**made)}")
         if poses := metrics["pose_aligned"]:
-            error = poses["pin_error_px"]
-            lines.append(
-                f"pin error from the labels: {error['test']:.2f} px on unseen frames ({error['fitted']:.2f} px on the fitted ones)"
-            )
+            unseen, fitted = (poses["pin_error_px"][part] for part in ("test", "fitted"))
+            lines.append(f"pin error from the labels: {unseen:.2f} px on unseen frames ({fitted:.2f} px on the fitted ones)")
             lines.append(_image_line("pose-aligned, unseen", metrics["frames"] // 2, poses["test_images"]))
         return [*lines, _verdict(**found["target"])]
 

@@ -86,7 +86,7 @@ def _stiffness(sensor: SensorSpec, solid: Solid) -> FloatArray:
         controls = kind.cells.controls
         count = controls.shape[1]
         blocks = np.zeros((len(controls), len(PAIRS), count, count))
-        kind.stiffness(solid.control_mm, np.zeros((len(controls), 8, 3, 3)), 0.0, blocks)
+        kind.stiffness(solid.control_mm, 0.0, blocks)
         at = first[controls]
         for p, (i, k) in enumerate(PAIRS):
             np.add.at(matrix, (at[:, :, None] + i, at[:, None, :] + k), blocks[:, p])

@@ -1,6 +1,6 @@
 """Contact and friction on the skin: exact Coulomb contact at a few hundred nodes, with friction's memory.
 
-Forces f at the nodes displace the skin by u = C f (see ``compliance``) plus the correction of ``bending``. At every pose of the object the
+Forces f at the nodes displace the skin by u = C f (see ``compliance``) plus the bending of ``model``. At every pose of the object the
 solver looks for forces with which each node is in one of three states: it is clear of the object; it presses and sticks to its anchor; or
 it presses and slides at Coulomb's bound. It starts from the forces of the last pose, corrects one node at a time while it keeps the others
 fixed, and repeats this until no force changes (projected Gauss-Seidel: Jourdan, Alart & Jean 1998). Then it evaluates the bending again.
@@ -13,11 +13,11 @@ turns under the force so far; at the end of the motion this is repeated until th
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from training.surrogate.bending import bend, unbent
+from training.surrogate.model import LOOSE, Network, bend
 from training.surrogate.solids import distances_to
 from twin.compiled import compiled
 from twin.objects.analytic import CompiledSolid
@@ -56,13 +56,15 @@ MOST_SETTLING = 2
 
 
 class Laws(NamedTuple):
-    """What B contacts obey: the attributes of ``LinearContacts`` of these names."""
+    """What B contacts obey, and their poses and friction: the attributes of ``LinearContacts`` of these names."""
 
     kind: IntArray
     sizes: FloatArray
     friction: FloatArray
     compliance_mm_per_n: FloatArray
     turning: FloatArray
+    taken: FloatArray
+    used: FloatArray
 
 
 class Nodes(NamedTuple):
@@ -112,8 +114,8 @@ class LinearContacts:
         node i (first), mm/N.
     count : int
         B.
-    bending : tuple of float32 arrays, optional
-        Arrays of the network that corrects the linear skin (see ``Bending.kernel``); by default the skin is linear.
+    bending : tuple of float32 arrays
+        Arrays of the network that corrects the linear skin (see ``Bending.kernel``).
     still_mm : float
         Change of the bending between two motions up to which one evaluation of it is enough for a load step. With more than 0, a motion in
         very small steps costs half.
@@ -123,7 +125,7 @@ class LinearContacts:
     radius_mm : float
         Radius of the dome.
     kind : (B,) int
-        Kinds of the solids (see ``twin.objects.kernels.solid``).
+        Kinds of the solids (see ``twin.objects.analytic.solid``).
     sizes : (B, SIZES) float
         Parameters that give the solids' sizes.
     friction, compliance_mm_per_n : (B,) float
@@ -146,13 +148,11 @@ class LinearContacts:
         Share of Coulomb's bound that the pressing nodes bear together.
     """
 
-    def __init__(
-        self, node_mm: FloatArray, answer: FloatArray, count: int, *, bending: tuple[FloatArray, ...] | None = None, still_mm: float = 0.0
-    ) -> None:
+    def __init__(self, node_mm: FloatArray, answer: FloatArray, count: int, *, bending: Network, still_mm: float = 0.0) -> None:
         size = len(node_mm)
         self.node_mm, self.answer = node_mm, np.ascontiguousarray(answer.transpose(0, 3, 2, 1), np.float32)
         self.radius_mm = float(np.linalg.norm(node_mm[0]))
-        self.bending, self.still_mm = unbent(size) if bending is None else bending, still_mm
+        self.bending, self.still_mm = bending, still_mm
         self.kind, self.sizes, self.turning = np.zeros(count, np.int64), np.zeros((count, SIZES)), np.zeros((count, 10))
         self.friction, self.compliance_mm_per_n, self.used = np.zeros((3, count))
         self.taken = np.tile(np.eye(4), (count, 1, 1))
@@ -183,11 +183,11 @@ class LinearContacts:
 
     def move(self, rows: IntArray, start: FloatArray, stop: FloatArray) -> None:
         """Move the objects of some rows (R,) from poses ``start`` (R, 4, 4) to ``stop``: in a straight line, with a turn about one axis."""
-        skin = self.node_mm, self.answer, self.bending
+        skin = self.node_mm, self.answer, self.bending, self.still_mm
 
         def follow(which: slice) -> None:
             given = [np.ascontiguousarray(values[which]) for values in (rows, start, stop)]
-            _follow(*given, *skin, *self._state, self.taken, self.used, self.still_mm, self._kept)
+            _follow(*given, skin, *self._state, self._kept)
 
         threads = min(len(rows) // ROWS_OF_A_THREAD, MOST_THREADS)
         if threads < 2:
@@ -207,9 +207,7 @@ class LinearContacts:
             Distance of the dome's centre from the object, and the cosine of the angle between the apex and the dome's place nearest to the
             object. They give the depth exactly, also where the deepest place lies between or beyond the nodes.
         """
-        gap, centre = np.empty((len(rows), len(self.node_mm))), np.empty((len(rows), 2))
-        _distances(rows, np.ascontiguousarray(T), self.node_mm, self.kind, self.sizes, gap, centre)
-        return gap, centre
+        return _distances(rows, np.ascontiguousarray(T), self.node_mm, self.kind, self.sizes)
 
 
 @compiled()
@@ -234,9 +232,8 @@ def between(start: FloatArray, stop: FloatArray, steps: int) -> FloatArray:
 
 
 @compiled()
-def _distances(
-    rows: IntArray, T: FloatArray, node: FloatArray, kind: IntArray, sizes: FloatArray, gap: FloatArray, centre: FloatArray
-) -> None:
+def _distances(rows: IntArray, T: FloatArray, node: FloatArray, kind: IntArray, sizes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    gap, centre = np.empty((len(rows), len(node))), np.empty((len(rows), 2))
     points, middle = np.empty_like(node), np.empty((1, 3))
     still, origin = np.zeros_like(node), np.zeros((1, 3))
     for r in range(len(rows)):
@@ -248,27 +245,16 @@ def _distances(
         distance, outward = distances_to(middle, kind[row], sizes[row])
         centre[r, 0] = distance[0]
         centre[r, 1] = -(turn[2, 0] * outward[0, 0] + turn[2, 1] * outward[0, 1] + turn[2, 2] * outward[0, 2])
+    return gap, centre
 
 
 @compiled(nogil=True)
-def _follow(
-    rows: IntArray,
-    start: FloatArray,
-    stop: FloatArray,
-    node: FloatArray,
-    answer: FloatArray,
-    bending: tuple[FloatArray, ...],
-    laws: Laws,
-    nodes: Nodes,
-    taken: FloatArray,
-    used: FloatArray,
-    still_mm: float,
-    kept: Kept,
-) -> None:
+def _follow(rows: IntArray, start: FloatArray, stop: FloatArray, skin: tuple[Any, ...], laws: Laws, nodes: Nodes, kept: Kept) -> None:
     """Solve each row's motion from ``start`` to ``stop`` (R, 4, 4) in load steps.
 
-    The arrays of all B rows are those of ``LinearContacts``.
+    The arrays of all B rows are those of ``LinearContacts``; ``skin`` are its nodes, their compliance, its bending and ``still_mm``.
     """
+    node, answer, bending, still_mm = skin
     here = np.empty_like(node)
     shift = np.empty((3, len(node)), np.float32)
     near = np.empty(len(node), np.int64)
@@ -281,9 +267,9 @@ def _follow(
         mine = Nodes(force[row], moved[row], bent[row], anchor[row], seen[row], before[row], held[row], slides[row])
         for step in range(steps + MOST_SETTLING):
             T = _deflect_arm(way[min(step, last)], laws.turning[row], mine.force_n)
-            if step > last and moved_mm(taken[row], T, node[0, 2]) <= SETTLED_MM:
+            if step > last and moved_mm(laws.taken[row], T, node[0, 2]) <= SETTLED_MM:
                 break
-            taken[row] = T
+            laws.taken[row] = T
             turn, place = T[:3, :3], T[:3, 3]
             count, change, off = 0, np.inf, np.inf
             gap = before[row]
@@ -308,7 +294,7 @@ def _follow(
                     off = _solve(answer, Touching(near[:count], among, turn, here, gap, normal), mine, shift, mu, soft, part)
             if count:
                 _to_object_frame(node, mine.moved_mm, turn, place, here)
-                used[row] = _record_friction(Touching(near[:count], among, turn, here, gap, normal), mine, mu)
+                laws.used[row] = _record_friction(Touching(near[:count], among, turn, here, gap, normal), mine, mu)
             before[row], seen[row] = gap, here
 
 
@@ -396,7 +382,7 @@ def _among(answer: FloatArray, near: IntArray, row: int, kept: Kept) -> FloatArr
     return c
 
 
-@compiled(fastmath={"reassoc", "contract", "arcp", "nsz"})
+@compiled(fastmath=LOOSE)
 def _solve(answer: FloatArray, at: Touching, nodes: Nodes, shift: FloatArray, friction: float, compliance: float, part: int) -> float:
     """Solve for the forces (M, 3) of the near nodes (q,) and the displacements (M, 3) of all nodes.
 
@@ -412,13 +398,10 @@ def _solve(answer: FloatArray, at: Touching, nodes: Nodes, shift: FloatArray, fr
     sunk = 0.0  # displacement of the compliant object along z
     for a in range(count):
         i = near[a]
+        x, y, z = here[i, 0] - anchor[i, 0], here[i, 1] - anchor[i, 1], here[i, 2] - anchor[i, 2]
         for p in range(3):
             n[a, p] = turn[p, 0] * normal[i, 0] + turn[p, 1] * normal[i, 1] + turn[p, 2] * normal[i, 2]
-            lag[a, p] = (
-                turn[p, 0] * (here[i, 0] - anchor[i, 0])
-                + turn[p, 1] * (here[i, 1] - anchor[i, 1])
-                + turn[p, 2] * (here[i, 2] - anchor[i, 2])
-            )
+            lag[a, p] = turn[p, 0] * x + turn[p, 1] * y + turn[p, 2] * z
         total, trace = compliance * n[a, 2] * n[a, 2], compliance
         for p in range(3):
             trace += c[a, p, p, a]

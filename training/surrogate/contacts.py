@@ -49,14 +49,9 @@ class SurrogateContacts:
         self._rest = rest_of(sensor)
         self._cap_mm = sensor.pins.length_mm + sensor.pins.cap_height_mm / 2
         modes = surrogate.modes
-        flat = len(modes), -1
-        x, y, z = surrogate.node_mm.T
-        turns = np.zeros((len(x), 3, 6))  # of a force at each node: the force and the torque on the object
-        turns[:, range(3), range(3)] = -1.0
-        turns[:, 0, 4:], turns[:, 1, 3], turns[:, 1, 5] = np.stack([-z, y], axis=1), z, -x
-        turns[:, 2, 3:5] = np.stack([-y, x], axis=1)
-        self._turns = turns.reshape(-1, 6)
-        self._cap_modes = np.ascontiguousarray((modes[:, :, 0] + self._cap_mm * modes[:, :, 1]).reshape(flat), np.float32)
+        force = np.tile(-np.eye(3), (len(surrogate.node_mm), 1))  # on the object, by a unit force at each node along each axis
+        self._turns = np.concatenate([force, np.cross(surrogate.node_mm.repeat(3, axis=0), force) + 0.0], axis=1)
+        self._cap_modes = np.ascontiguousarray((modes[:, :, 0] + self._cap_mm * modes[:, :, 1]).reshape(len(modes), -1), np.float32)
         self._caps_rest = self._rest[:, 0] + self._cap_mm * self._rest[:, 1]
         bending, still = surrogate.bending.kernel(surrogate.read), STILL_MM if few else 0.0
         self._linear = LinearContacts(surrogate.node_mm, surrogate.answer, count, bending=bending, still_mm=still)

@@ -12,11 +12,10 @@ import torch
 
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
-from training.surrogate.bending import Bending, ample
 from training.surrogate.compliance import NODE_RINGS, Compliance, compliance_of, interpolation_matrix
 from training.surrogate.contact import LinearContacts
 from training.surrogate.contacts import SurrogateContacts
-from training.surrogate.model import SHIPPED, SUFFIX, Surrogate, features, gate, load_surrogate, mechanics_of, within
+from training.surrogate.model import SHIPPED, SUFFIX, Bending, Surrogate, ample, features, gate, load_surrogate, mechanics_of, within
 from training.surrogate.paths import DEEPEST_MM, STICKING
 from training.surrogate.reading import EpisodeContact
 from training.surrogate.samples import PIN_RINGS, SolvedPath, lattice_sensor, solve_paths
@@ -93,9 +92,8 @@ class Distilled(ReadableResult):
             f"slip share {every['slip']:.3f}",
         ]
         for kind, parts in found["by"].items():
-            lines.append(
-                f"by {kind}: " + ", ".join(f"{name} {told['pins_px']:.2f} px, {told['force_share']:.0%}" for name, told in parts.items())
-            )
+            each = (f"{name} {told['pins_px']:.2f} px, {told['force_share']:.0%}" for name, told in parts.items())
+            lines.append(f"by {kind}: {', '.join(each)}")
         return lines
 
 
@@ -112,18 +110,6 @@ class _Samples:
     wrench: FloatArray  # (S, 6)
     area: FloatArray  # (S,)
     slip: FloatArray  # (S,), true sliding share minus the linear skin's share of sliding nodes
-
-
-@dataclass(frozen=True)
-class _Truths:
-    """S states of the finite elements: displacements of and forces on the nodes (S, M, 3), float32."""
-
-    moved: FloatArray
-    force: FloatArray
-
-    def turn(self, g: Symmetry) -> "_Truths":
-        """The same states, turned or mirrored."""
-        return _Truths(g.move_vectors(self.moved, NODE_RINGS), g.move_vectors(self.force, NODE_RINGS))
 
 
 @writes_file("out")
@@ -187,11 +173,11 @@ def fit(sensor: SensorSpec, solved: Sequence[SolvedPath], start: Surrogate, *, p
     linear_pins = np.stack([skin.base, skin.axis]).astype(np.float32) * weights[..., None, None]  # (2, P, 3, M, 3)
     flat = linear_pins.reshape(linear_pins.shape[0] * linear_pins.shape[1] * 3, -1)
     group = symmetries(sensor.pins.phase_deg)
-    truths = _truths(seen)
-    moves = truths.force.reshape(len(truths.force), -1) @ answer.transpose(0, 3, 1, 2).reshape(3 * len(answer), -1)
-    softness = float((moves * truths.moved.reshape(moves.shape)).sum() / (moves**2).sum())
+    moved, force = _truths(seen)
+    moves = force.reshape(len(force), -1) @ answer.transpose(0, 3, 1, 2).reshape(3 * len(answer), -1)
+    softness = float((moves * moved.reshape(moves.shape)).sum() / (moves**2).sum())
     answer, flat = softness * answer, softness * flat
-    turned = [truths.turn(g) for g in group]
+    turned = [(g.move_vectors(moved, NODE_RINGS), g.move_vectors(force, NODE_RINGS)) for g in group]
     modes = _carry_modes(start, sensor, weights)
     read = modes @ flat
     bending = _bending(turned, answer, read, start.bending, progress)
@@ -199,9 +185,8 @@ def fit(sensor: SensorSpec, solved: Sequence[SolvedPath], start: Surrogate, *, p
     rng = np.random.default_rng(0)
     turns = rng.uniform(0.0, np.pi / 3, (len(seen), TURNS))
     turns[:, 0] = 0.0
-    rows = _join_samples(
-        [sample_states(sensor, skin, answer, path, turn, kernel) for path, angles in zip(seen, turns, strict=True) for turn in angles]
-    )
+    places = [(path, turn) for path, angles in zip(seen, turns, strict=True) for turn in angles]
+    rows = _join_samples([sample_states(sensor, skin, answer, path, kernel, turn) for path, turn in places])
     rows = replace(rows, pins=rows.pins * weights)
     inputs, outputs = [], []
     for g in group:
@@ -256,12 +241,7 @@ def average_compliance(nodes: FloatArray, phase_deg: float) -> FloatArray:
 
 
 def sample_states(
-    sensor: SensorSpec,
-    skin: Compliance,
-    answer: FloatArray,
-    path: SolvedPath,
-    turn_rad: float = 0.0,
-    bending: tuple[FloatArray, ...] | None = None,
+    sensor: SensorSpec, skin: Compliance, answer: FloatArray, path: SolvedPath, bending: tuple[FloatArray, ...], turn_rad: float = 0.0
 ) -> _Samples:
     """States of the linear skin along a solved path, and the true states, both turned about the sensor's axis.
 
@@ -299,26 +279,30 @@ def _carry_modes(start: Surrogate, sensor: SensorSpec, weights: FloatArray) -> F
     return np.ascontiguousarray(modes.reshape(len(modes), -1))
 
 
-def _truths(solved: Sequence[SolvedPath]) -> _Truths:
-    """The pressed states of solved paths whose force lies within the nodes, up to the share ``LOST``."""
+def _truths(solved: Sequence[SolvedPath]) -> tuple[FloatArray, FloatArray]:
+    """Displacements of and forces on the nodes (S, M, 3) float32 in the pressed states of solved paths whose force lies within the nodes,
+    up to the share ``LOST``."""
     moved, force = [], []
     for path in solved:
         lost = np.linalg.norm(path.node_n.sum(axis=1) + path.force_n, axis=1)
         whole = lost < LOST * np.linalg.norm(path.force_n, axis=1)
         moved.append(path.node_mm[whole])
         force.append(path.node_n[whole])
-    return _Truths(np.concatenate(moved).astype(np.float32), np.concatenate(force).astype(np.float32))
+    return np.concatenate(moved).astype(np.float32), np.concatenate(force).astype(np.float32)
 
 
-def _bending(turned: Sequence[_Truths], answer: FloatArray, read: FloatArray, start: Bending, progress: Any) -> Bending:
-    """Fit the bending: the true displacements minus those of the linear skin under the same forces. ``turn`` has all symmetries."""
+def _bending(turned: Sequence[tuple[FloatArray, ...]], answer: FloatArray, read: FloatArray, start: Bending, progress: Any) -> Bending:
+    """Fit the bending: the true displacements minus those of the linear skin under the same forces.
+
+    ``turned`` holds the displacements and forces of ``_truths`` under each symmetry, the identity first.
+    """
     compliance = answer.transpose(0, 3, 1, 2).reshape(3 * len(answer), -1).astype(np.float32)
-    forces = [part.force.reshape(len(part.force), -1) for part in turned]
-    lacks = [part.moved.reshape(len(part.moved), -1) - force @ compliance for part, force in zip(turned, forces, strict=True)]
+    forces = [force.reshape(len(force), -1) for _, force in turned]
+    lacks = [moved.reshape(len(moved), -1) - force @ compliance for (moved, _), force in zip(turned, forces, strict=True)]
     modes = start.modes.reshape(-1, len(compliance))
     x, y = np.concatenate([force @ read.T for force in forces]), np.concatenate([part @ modes.T for part in lacks])
     x = x / start.scale
-    counts = np.tile(1.0 / (LEAST_MOVED_MM**2 + (turned[0].moved ** 2).sum(axis=2).max(axis=1)), len(turned))
+    counts = np.tile(1.0 / (LEAST_MOVED_MM**2 + (turned[0][0] ** 2).sum(axis=2).max(axis=1)), len(turned))
     light = (1.0 / (LIGHT + (x**2).mean(axis=1)))[:, None]  # the linear part is for light contacts, so they weigh most
     straight = np.linalg.solve((x * light).T @ x + STEADY * len(x) * np.eye(x.shape[1]), (x * light).T @ y).T
     layers = _train_network(x, y - x @ straight.T, ample(x), (counts / counts.mean()).astype(np.float32), start.layers, progress)
@@ -332,7 +316,7 @@ def measure_errors(surrogate: Surrogate, sensor: SensorSpec, solved: Sequence[So
     rest, lattice_rest = rest_pins(sensor.geometry), rest_pins(lattice.geometry)
     px = partial(project_in_form, sensor, form)
     rest_px = px(rest.caps_mm)
-    states: list[dict[str, Any]] = []
+    states: list[tuple[Any, ...]] = []
     for path in solved:
         obj = ObjectSpec(name="drawn", description="", shape=path.shape)
         contacts = SurrogateContacts(surrogate, sensor, 1)
@@ -346,13 +330,11 @@ def measure_errors(surrogate: Surrogate, sensor: SensorSpec, solved: Sequence[So
             true_px = px(rest.caps_mm + onto @ moved)
             off = np.linalg.norm(px(contacts.felt.caps_mm[0]) - true_px, axis=1)
             largest = float(np.linalg.norm(true_px - rest_px, axis=1).max())
-            force = {"force": path.force_n[number], "force_error": contacts.felt.force_n[0] - path.force_n[number]}
-            state = {"error": off, "largest": largest, "share": off / max(largest, 1e-9), "depth_mm": depth, "object": path.shape.kind}
-            state |= {key: float(np.linalg.norm(value)) for key, value in force.items()}
-            state["slip"] = abs(float(contacts.felt.slip[0]) - path.slip[number])
-            state["shear_mm"] = float(np.linalg.norm(moved[:, :2], axis=1).max())
-            states.append(state)
-    values = {key: np.array([state[key] for state in states]) for key in MEASURED}
+            true_n, slip = path.force_n[number], abs(float(contacts.felt.slip[0]) - path.slip[number])
+            force, force_error = (float(np.linalg.norm(value)) for value in (true_n, contacts.felt.force_n[0] - true_n))
+            shear_mm = float(np.linalg.norm(moved[:, :2], axis=1).max())
+            states.append((off, largest, off / max(largest, 1e-9), depth, path.shape.kind, force, force_error, slip, shear_mm))
+    values = {key: np.array([state[k] for state in states]) for k, key in enumerate(MEASURED)}
     large = values["largest"] >= LARGE_PX
 
     def summarise(rows: Any) -> dict[str, float]:

@@ -1,10 +1,19 @@
 """The surrogate: a linear skin with exact contact and friction, and two small networks that correct it for large deformations.
 
-The first network corrects the skin while its contact is solved (see ``bending``). This gives the forces f at the nodes. From f follow
+The first network, the bending, corrects the skin while its contact is solved. The body is elastic. So the displacements u of the skin's
+nodes depend on the present nodal forces f alone, not on their history:
+
+    u = C f + modes (straight x + g(x) net(x)),   x = R f / scale,   g = tanh(mean(x^2) / AMPLE)
+
+C f is the linear skin's displacement, and R f its displacement in the modes of the pins. The gate g goes to zero with the forces, so the
+network adds only terms of higher order. The scale of C is fitted to all contacts; the matrix ``straight`` corrects C for light contacts.
+Because the correction acts inside the solution, nodes stick and slip at the forces of the true skin.
+
+The second network corrects what the pins do and what is felt. From f follow
 
     pins = rest + modes (R f + gate(depth) net(R f, V g, features)),   force = -sum f + gate net
 
-R f is the linear skin's answer in the modes of the pins. V g describes where the object is: the distances g of the nodes at rest from it,
+V g describes where the object is: the distances g of the nodes at rest from it,
 in their principal directions. The gate goes to zero with the depth, so a sensor without contact is exactly at rest. The features are depth,
 friction, number of pressing nodes, share of sliding nodes, used share of Coulomb's bound, force and torque of the nodal forces. Only f
 depends on the history of the contact, so the network has no memory of its own that could drift.
@@ -17,9 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from scenes.base import Section
 from scenes.sensor import SensorSpec
-from training.surrogate.bending import LOOSE, Bending, add_product, apply_silu
 from training.surrogate.compliance import NODE_RINGS, POLAR_DEG
 from training.surrogate.symmetry import ring_directions, symmetries
 from twin.compiled import compiled
@@ -30,6 +37,12 @@ from twin.types import FloatArray, IntArray
 
 SHIPPED = Path(__file__).parents[1] / "surrogates"
 SUFFIX = ".safetensors"
+AMPLE = 0.1
+"""Mean square of the scaled inputs at which the gate of the bending's network is three quarters open."""
+LOOSE = {"reassoc", "contract", "arcp", "nsz"}
+"""What the compiler may assume about sums and products of the networks."""
+TAKEN = 0.5
+"""Relaxation factor of an update of the bending. With 1, solutions of deep contacts oscillate: a skin that bends more bears less force."""
 GATE_MM = 0.3
 """Depth at which the gate of the network is three quarters open."""
 MECHANICS = ("skin", "gel", "lens", "pins")
@@ -48,6 +61,8 @@ WRENCH_SCALE = np.array([1.0, 1.0, 1.0, 10.0, 10.0, 10.0])
 """Scales of force (N) and torque (N mm) as inputs of the network."""
 BLOCK = 4
 """Rows of a product of matrices. The order in which BLAS sums depends on their number."""
+Network = tuple[FloatArray, ...]
+"""Arrays of a network for compiled functions: see ``Bending.kernel`` and ``Surrogate.kernel``."""
 BESIDE = 8
 """Number of the network's outputs besides the modes: force, torque, area in 100 mm2, sliding share."""
 
@@ -61,6 +76,105 @@ NAMED = ("modes", "read", "view", "mean", "scale", "out_scale")
 WHOLE = ("mean", "scale", "offset")
 """Ends of the names of arrays that are not rounded to half precision."""
 FILE = ArrayFile("surrogate", "twin surrogate", version=3, error=SurrogateError)
+
+
+@dataclass(frozen=True)
+class Bending:
+    """The network of a skin with M nodes, K inputs and O modes.
+
+    Attributes
+    ----------
+    scale : (K,) float32
+        Scale of each input.
+    straight : (O, K) float32
+        Linear part of the correction.
+    layers : tuple of ((o, i), (o,)) float32
+        Three layers: weights and offsets.
+    modes : (O, M, 3) float32
+        Displacements of the nodes, mm.
+    """
+
+    scale: FloatArray
+    straight: FloatArray
+    layers: Layers
+    modes: FloatArray
+
+    def kernel(self, read: FloatArray) -> Network:
+        """The arrays that ``bend`` takes, in its memory layout; ``read`` (K, 3 M) is the linear skin's answer in the modes of the pins."""
+        seen = (read / self.scale[:, None]).T.reshape(-1, 3, len(read))
+        (first, a), (second, b), (third, c) = self.layers
+        given = seen, first.T, a, second.T, b, third.T, c, self.straight.T, self.modes.transpose(0, 2, 1)
+        return tuple(np.ascontiguousarray(values, np.float32) for values in given)
+
+
+def ample(x: FloatArray) -> FloatArray:
+    """The gate of the network, (S,), from 0 to 1, for scaled inputs (S, K)."""
+    return np.tanh((x**2).mean(axis=1) / AMPLE)
+
+
+@compiled(nogil=True, fastmath=LOOSE)
+def add_product(x: FloatArray, matrix: FloatArray, out: FloatArray) -> None:
+    """Add ``x`` (i,) times a matrix (i, o) to ``out`` (o,)."""
+    for k in range(len(x)):
+        row, value = matrix[k], x[k]
+        for o in range(len(out)):
+            out[o] += row[o] * value
+
+
+@compiled(nogil=True, fastmath=LOOSE)
+def _apply_silu(x: FloatArray) -> None:
+    """Apply the activation of the layers to ``x`` (i,)."""
+    for k in range(len(x)):
+        x[k] = x[k] / (np.float32(1.0) + np.exp(-x[k]))
+
+
+@compiled(nogil=True, fastmath=LOOSE)
+def three_layers(x: FloatArray, network: Network) -> FloatArray:
+    """Output (o,) of a network of three layers for ``x`` (i,): each layer's weights (i, o), then its offset."""
+    first, a, second, b, third, c = network
+    one, two, out = a.copy(), b.copy(), c.copy()
+    add_product(x, first, one)
+    _apply_silu(one)
+    add_product(one, second, two)
+    _apply_silu(two)
+    add_product(two, third, out)
+    return out
+
+
+@compiled(nogil=True, fastmath=LOOSE)
+def bend(force: FloatArray, bent: FloatArray, moved: FloatArray, network: Network) -> float:
+    """Update the bending ``bent`` (3, M) float32 toward that of the forces (M, 3), and the displacements ``moved`` (M, 3) by the same.
+
+    ``network`` is as ``Bending.kernel`` gives it. Returns the largest change along an axis, mm.
+    """
+    read, straight, modes = network[0], network[7], network[8]
+    seen = read.shape[2]
+    x = np.zeros(seen, np.float32)
+    for i in range(len(force)):
+        if force[i, 0] == 0 and force[i, 1] == 0 and force[i, 2] == 0:
+            continue
+        f0, f1, f2 = np.float32(force[i, 0]), np.float32(force[i, 1]), np.float32(force[i, 2])
+        r = read[i]
+        for k in range(seen):
+            x[k] += r[0, k] * f0 + r[1, k] * f1 + r[2, k] * f2
+    size = np.float32(0.0)
+    for k in range(seen):
+        size += x[k] * x[k]
+    gate = np.float32(np.tanh(size / seen / AMPLE))
+    out = three_layers(x, network[1:7])
+    for o in range(len(out)):
+        out[o] *= gate
+    add_product(x, straight, out)
+    most = np.float32(0.0)
+    for p in range(3):
+        whole = np.zeros(bent.shape[1], np.float32)
+        add_product(out, modes[:, p], whole)
+        for j in range(len(whole)):
+            change = np.float32(TAKEN) * (whole[j] - bent[p, j])
+            most = max(most, abs(change))
+            moved[j, p] += change
+            bent[p, j] += change
+    return float(most)
 
 
 @dataclass(frozen=True)
@@ -125,7 +239,7 @@ class Surrogate:
         found = through_layers(self.layers, x, silu, by_row) * (self.out_scale * gate(depth_mm)[:, None]).astype(np.float32)
         return linear + found[:, : len(self.modes)], found[:, len(self.modes) :]
 
-    def kernel(self) -> tuple[FloatArray, ...]:
+    def kernel(self) -> Network:
         """The arrays that ``answer_each`` takes, in its memory layout."""
         (first, a), (second, b), (third, c) = self.layers
         seen = self.read.T.reshape(-1, 3, len(self.read))
@@ -151,7 +265,7 @@ class Surrogate:
 
 
 @compiled(fastmath=LOOSE)
-def answer_each(rows: IntArray, state: tuple[Any, ...], turns: FloatArray, network: tuple[FloatArray, ...], found: FloatArray) -> None:
+def answer_each(rows: IntArray, state: tuple[Any, ...], turns: FloatArray, network: Network, found: FloatArray) -> None:
     """Write to ``found`` (B, K + BESIDE) float32 what some sensors feel: coefficients of the modes, force, torque, area, sliding share.
 
     It is ``Surrogate.correct`` without matrices of all rows. ``state`` is of all contacts: the nodes' forces (B, M, 3), whether they press
@@ -159,7 +273,7 @@ def answer_each(rows: IntArray, state: tuple[Any, ...], turns: FloatArray, netwo
     ``network`` is that of ``Surrogate.kernel``.
     """
     force_n, held, slides, friction, used, gap_mm = state
-    read, view, mean, scale, first, a, second, b, third, c, out_scale = network
+    read, view, mean, scale, out_scale = network[0], network[1], network[2], network[3], network[10]
     count = read.shape[2]
     for row in rows:
         gap, mu, x, wrench, deepest = gap_mm[row], friction[row], np.zeros(len(mean), np.float32), np.zeros(6), np.inf
@@ -189,12 +303,7 @@ def answer_each(rows: IntArray, state: tuple[Any, ...], turns: FloatArray, netwo
         out[count + 6], out[count + 7] = 0.0, slip
         for k in range(len(x)):
             x[k] = (x[k] - mean[k]) / scale[k]
-        one, two, last = a.copy(), b.copy(), c.copy()
-        add_product(x, first, one)
-        apply_silu(one)
-        add_product(one, second, two)
-        apply_silu(two)
-        add_product(two, third, last)
+        last = three_layers(x, network[4:10])
         share = np.float32(np.tanh(depth / GATE_MM))
         for k in range(len(out)):
             out[k] += last[k] * out_scale[k] * share
@@ -212,10 +321,8 @@ def features(
     depth_mm: FloatArray, friction: FloatArray, held: FloatArray, slip: FloatArray, used: FloatArray, wrench: FloatArray
 ) -> FloatArray:
     """Inputs of the network besides the modes and the views of the object, (R, FEATURES)."""
-    rub = np.log(np.maximum(friction, 0.01))
-    return np.column_stack(
-        [depth_mm, depth_mm**2 / 5.0, rub, np.minimum(friction, 1.5) * depth_mm, held / 10.0, slip, used, wrench / WRENCH_SCALE]
-    )
+    rub, drag = np.log(np.maximum(friction, 0.01)), np.minimum(friction, 1.5) * depth_mm
+    return np.column_stack([depth_mm, depth_mm**2 / 5.0, rub, drag, held / 10.0, slip, used, wrench / WRENCH_SCALE])
 
 
 def within(gap_mm: FloatArray) -> FloatArray:
@@ -270,18 +377,14 @@ def _of_arrays(about: dict[str, Any], arrays: Mapping[str, FloatArray]) -> Surro
 
 def mechanics_of(sensor: SensorSpec) -> dict[str, Any]:
     """The sections of a specification that decide its mechanics, without the keys that only the optics need."""
-    return _mechanics_of({part: getattr(sensor, part) for part in MECHANICS})
-
-
-def _mechanics_of(sections: Mapping[str, Section]) -> dict[str, Any]:
-    plain = {part: section.model_dump(mode="json") for part, section in sections.items()}
+    plain = {part: getattr(sensor, part).model_dump(mode="json") for part in MECHANICS}
     return {part: {key: value for key, value in plain[part].items() if is_mechanical(part, key)} for part in MECHANICS}
 
 
 def unlike_parts(saved: Mapping[str, Any], sensor: SensorSpec) -> list[str]:
     """Sections in which a surrogate's saved mechanics are not those of a sensor. An earlier version saved more keys with their defaults."""
-    told = _mechanics_of({part: type(getattr(sensor, part)).model_validate(saved[part]) for part in MECHANICS})
-    wanted = mechanics_of(sensor)
+    sections = {part: type(getattr(sensor, part)).model_validate(saved[part]) for part in MECHANICS}
+    told, wanted = mechanics_of(sensor.model_copy(update=sections)), mechanics_of(sensor)
     return [part for part in MECHANICS if told[part] != wanted[part]]
 
 
@@ -300,10 +403,8 @@ def surrogate_of(sensor: SensorSpec, file: str | Path | None = None) -> Surrogat
     """
     if file is not None:
         found = load_surrogate(Path(file))
-        if parts := unlike_parts(found.about["mechanics"], sensor):
-            raise SurrogateError(
-                f"{file}: of a sensor with another [{'], ['.join(parts)}]; make one of {sensor.name} with 'twin surrogate'"
-            )
+        if parts := "], [".join(unlike_parts(found.about["mechanics"], sensor)):
+            raise SurrogateError(f"{file}: of a sensor with another [{parts}]; make one of {sensor.name} with 'twin surrogate'")
         return found
     for path in sorted(SHIPPED.glob(f"*{SUFFIX}")):
         if not unlike_parts(FILE.about(path)["mechanics"], sensor):

@@ -73,9 +73,8 @@ def draw_shape(rng: np.random.Generator) -> Shape:
     if kind == "edge":
         return EdgeShape(kind="edge", fillet_mm=draw_size(LEAST_FILLET_MM, 3.0))
     fillet = draw_size(1.0, 8.0)
-    return PrismShape(
-        kind="prism", sides=int(rng.integers(3, 7)), inradius_mm=max(fillet, draw_size(LEAST_MM["prism"], 45.0)), fillet_mm=fillet
-    )
+    sides, inradius_mm = int(rng.integers(3, 7)), max(fillet, draw_size(LEAST_MM["prism"], 45.0))
+    return PrismShape(kind="prism", sides=sides, inradius_mm=inradius_mm, fillet_mm=fillet)
 
 
 def unlike_drawn(obj: ObjectSpec) -> str:

@@ -81,19 +81,12 @@ def solve_path(solver: SkinSolver, nodes: AtNodes, drawn: DrawnPath, *, step_mm:
     except ContactError:
         if len(states) == 1:
             return None
-    return SolvedPath(
-        drawn.shape,
-        drawn.friction,
-        np.array([s.T_sensor_object for s in states]),
-        np.array([s.base_mm for s in states], np.float32),
-        np.array([s.axis for s in states], np.float32),
-        np.array([s.force_n for s in states]),
-        np.array([s.torque_nmm for s in states]),
-        np.array([s.point_area_mm2.sum() for s in states]),
-        np.array([s.slip_share for s in states]),
-        np.array([nodes.moved_mm(s) for s in states]),
-        np.array([nodes.force_n(s) for s in states]),
-    )
+    rows = []
+    for s in states:
+        single = s.base_mm.astype(np.float32), s.axis.astype(np.float32)
+        felt = s.force_n, s.torque_nmm, s.point_area_mm2.sum(), s.slip_share
+        rows.append((s.T_sensor_object, *single, *felt, nodes.moved_mm(s), nodes.force_n(s)))
+    return SolvedPath(drawn.shape, drawn.friction, *(np.array(column) for column in zip(*rows, strict=True)))
 
 
 def solve_paths(sensor: SensorSpec, numbers: Sequence[int], *, processes: int, progress: Step) -> list[SolvedPath]:

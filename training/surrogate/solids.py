@@ -10,12 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.compiled import compiled
-from twin.objects.analytic import CompiledSolid
-from twin.objects.kernels import solid
+from twin.objects.analytic import CompiledSolid, solid
 from twin.types import FloatArray
 
 SWEPT, DRUM, OVAL = 10, 11, 12
-"""Codes of the kinds, beside those of ``twin.objects.kernels``."""
+"""Codes of the kinds, beside those of ``twin.objects.analytic``."""
 ROUNDS, ENOUGH = 40, 1e-12
 """Most steps of Newton's method, and the relative change at which it ends."""
 

@@ -10,6 +10,7 @@ with its neighbours', and the largest average, a (px), gives the probability (at
 import numpy as np
 
 from training.models.vgnn.registration import align
+from twin.pins.flips import directed_edges
 from twin.pins.labelling.reference import Reference
 from twin.types import BoolArray, FloatArray
 
@@ -33,11 +34,8 @@ class TouchAnswer:
 
     def __init__(self, reference: Reference) -> None:
         count = len(reference.pins_px)
-        around = np.eye(count)
-        for first, second in ((0, 1), (1, 2), (2, 0)):
-            around[reference.triangles[:, first], reference.triangles[:, second]] = 1.0
-            around[reference.triangles[:, second], reference.triangles[:, first]] = 1.0
-        self._reference, self._around = reference, around
+        self._reference, self._around = reference, np.eye(count)
+        self._around[tuple(directed_edges(reference.triangles, count).T)] = 1.0
 
     def __call__(self, nodes_px: FloatArray, lost: BoolArray) -> float:
         """Probability of a contact, from pins (N, 2). Pins that are ``lost`` (N,) are not used. NaN if all are lost."""

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import nn
+from torch.nn.utils.rnn import pad_sequence
 
 from scenes.layouts.rings import Rings
 from scenes.sensor import SensorSpec
@@ -33,7 +34,7 @@ from training.surrogate.symmetry import Symmetry, symmetries
 from training.touch.contact_maps import HEADROOM
 from twin.camera.projection import project_in_form
 from twin.errors import ErrorsAs
-from twin.frames.truth import arrays_of, open_truth
+from twin.frames.truth import arrays_of, image_name, open_truth
 from twin.geometry.pins import rest_pins
 from twin.mechanics.path import carry_points
 from twin.mechanics.skin_map import skin_grid
@@ -278,17 +279,11 @@ def drags_of(data: Dataset) -> list[tuple[np.ndarray, Drag]]:
     nodes_mm = skin_grid(data.pins.sensor.geometry).nodes_mm
     order = {name: row for row, name in enumerate(data.pins.image_name.tolist())}
     found: list[tuple[np.ndarray, Drag]] = []
-    counted: dict[int, int] = {}
-    for contact in arrays["path_id"].tolist():
-        counted[contact] = counted.get(contact, 0) + 1
-    start = 0
-    for contact, states in counted.items():
-        mine = slice(start, start + states)
-        start += states
-        rows = np.array([order.get(f"frame_{contact}_{state}.png", -1) for state in range(states)])
-        if (rows < 0).any() or states < 2:
-            continue
-        found.append((rows, _drag({key: array[mine] for key, array in arrays.items()}, nodes_mm)))
+    for contact in np.unique(arrays["path_id"]).tolist():
+        mine = np.flatnonzero(arrays["path_id"] == contact)
+        rows = np.array([order.get(image_name(contact, state), -1) for state in range(len(mine))])
+        if (rows >= 0).all() and len(rows) > 1:
+            found.append((rows, _drag({key: array[mine] for key, array in arrays.items()}, nodes_mm)))
     return found
 
 
@@ -350,7 +345,7 @@ def resample_path(drag: Drag, at: np.ndarray, eyes: CapView, rng: np.random.Gene
         return (values[low].T * (1 - part) + values[low + 1].T * part).T
 
     drag_mm, share, limit = between(drag.drag_mm), between(drag.share), drag.whole_mm
-    whole = drag_mm >= limit if np.isfinite(limit) else np.zeros(len(at), bool)
+    whole = drag_mm >= limit  # nowhere if the limit is NaN
     modes = eyes(between(drag.caps_mm), drag.lost[low], rng)
     return DragPath(modes, (share >= BEGINS) | whole, whole, share, np.maximum(limit - drag_mm, 0.0), drag_mm, drag.direction)
 
@@ -407,20 +402,16 @@ def _fit_filter(model: SlipModel, paths: list[DragPath], seed: int) -> None:
 
 def _pad_sequences(model: SlipModel, paths: list[DragPath]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Inputs (B, T, 2 D), a mask of the existing frames (B, T), and targets (B, T, 8) of paths, padded to the longest one's T frames."""
-    longest = max(len(path.modes) for path in paths)
-    x = np.zeros((len(paths), longest, 2 * paths[0].modes.shape[1]), np.float32)
-    there = np.zeros((len(paths), longest), bool)
-    wanted = np.zeros((len(paths), longest, 8), np.float32)
-    for k, path in enumerate(paths):
-        count = len(path.modes)
-        x[k, :count] = model.inputs(path.modes, np.concatenate([path.modes[:1], path.modes[:-1]]))
-        there[k, :count] = True
+    x, there, wanted = [], [], []
+    for path in paths:
+        x.append(torch.from_numpy(model.inputs(path.modes, np.concatenate([path.modes[:1], path.modes[:-1]]))))
+        there.append(torch.ones(len(path.modes), dtype=torch.bool))
         known = np.isfinite(path.left_mm) & ~path.whole
         log_left = np.log(np.where(known, path.left_mm, 1.0) + LEAST_LEFT_MM)
-        shown = path.drag_mm > SEEN_DRAG_MM
-        direction = np.tile(path.direction, (count, 1))
-        wanted[k, :count] = np.column_stack([path.begins, path.whole, known, log_left, shown, direction, path.share])
-    return torch.from_numpy(x), torch.from_numpy(there), torch.from_numpy(wanted)
+        shown, direction = path.drag_mm > SEEN_DRAG_MM, np.tile(path.direction, (len(known), 1))
+        columns = np.column_stack([path.begins, path.whole, known, log_left, shown, direction, path.share])
+        wanted.append(torch.from_numpy(columns).float())
+    return pad_sequence(x, True), pad_sequence(there, True), pad_sequence(wanted, True)
 
 
 def _loss(out: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:

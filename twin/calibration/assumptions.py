@@ -5,7 +5,7 @@ in each. A twin with another number, whose camera is fitted to the same pins at 
 displacements are most like those of the other twin, less the true ones, are the cost of the assumption.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 from scenes import load_object
 from scenes.sensor import SensorSpec
-from twin.calibration.camera_pose import FREE, fit_camera
+from twin.calibration.camera_pose import PARAMETERS, fit_camera
 from twin.calibration.size import of_radius
 from twin.camera.projection import project
 from twin.errors import ContactError, FrameError
@@ -35,6 +35,16 @@ PROBES = ((0.08, -5.0), (0.12, 5.0))
 """Depth and tilt of the contacts of the other twins."""
 MORE, TURN_DEG, STIFFER = 1.1, 5.0, 1.5
 """Changes: of a length, of the angle of the outermost pins, and of a modulus."""
+LONGER, STIFF = f"{MORE - 1:+.0%}", f"times {STIFFER:g}"
+NUMBERS = (
+    ("thickness of the skin, {:g} mm", "skin", "thickness_mm", MORE, 0.0, LONGER),
+    ("length of the pins, {:g} mm", "pins", "length_mm", MORE, 0.0, LONGER),
+    ("angle of the outermost pins, {:g} deg", "pins", "max_polar_deg", 1.0, TURN_DEG, f"{TURN_DEG:+g} deg"),
+    ("distance of the camera, {:.1f} mm", "camera", "distance_mm", MORE, 0.0, LONGER),
+    ("stiffness of the skin", "skin", "young_modulus_mpa", STIFFER, 0.0, STIFF),
+    ("stiffness of the gel", "gel", "young_modulus_mpa", STIFFER, 0.0, STIFF),
+)
+"""The assumed numbers beside the radius: title, section and key; factor and summand of their change, and the change in words."""
 
 
 @dataclass(frozen=True)
@@ -61,29 +71,14 @@ class AssumptionCost:
         return f"{self.assumed}: {self.change} moves depths by {100 * self.depth_share:+.0f} %, a tilt of 5 deg by {self.tilt_deg:+.1f} deg"
 
 
-def _with(spec: SensorSpec, section: str, key: str, change: Callable[[float], float]) -> SensorSpec:
-    """The specification with one number changed."""
-    return spec.alter(**{section: {key: change(getattr(getattr(spec, section), key))}})
-
-
-def _changes(spec: SensorSpec) -> dict[tuple[str, str], tuple[SensorSpec, str]]:
-    """Specifications with another number, by its name and change; and the key that a fit of the camera then holds."""
-    skin, longer, stiffer = spec.skin, f"{MORE - 1:+.0%}", f"times {STIFFER:g}"
-    return {
-        (f"radius of the tip, {skin.outer_radius_mm:g} mm", longer): (of_radius(spec, MORE * skin.outer_radius_mm), ""),
-        (f"thickness of the skin, {skin.thickness_mm:g} mm", longer): (_with(spec, "skin", "thickness_mm", lambda mm: MORE * mm), ""),
-        (f"length of the pins, {spec.pins.length_mm:g} mm", longer): (_with(spec, "pins", "length_mm", lambda mm: MORE * mm), ""),
-        (f"angle of the outermost pins, {spec.pins.max_polar_deg:g} deg", f"{TURN_DEG:+g} deg"): (
-            _with(spec, "pins", "max_polar_deg", lambda deg: deg + TURN_DEG),
-            "max_polar_deg",
-        ),
-        (f"distance of the camera, {spec.camera.distance_mm:.1f} mm", longer): (
-            _with(spec, "camera", "distance_mm", lambda mm: MORE * mm),
-            "distance_mm",
-        ),
-        ("stiffness of the skin", stiffer): (_with(spec, "skin", "young_modulus_mpa", lambda mpa: STIFFER * mpa), ""),
-        ("stiffness of the gel", stiffer): (_with(spec, "gel", "young_modulus_mpa", lambda mpa: STIFFER * mpa), ""),
-    }
+def _changes(spec: SensorSpec) -> dict[tuple[str, str], tuple[SensorSpec, bool]]:
+    """Specifications with another number, by its name and change; and whether pins at rest then need another camera."""
+    radius_mm = spec.skin.outer_radius_mm
+    changes = {(f"radius of the tip, {radius_mm:g} mm", LONGER): (of_radius(spec, MORE * radius_mm), False)}
+    for title, section, key, factor, added, change in NUMBERS:
+        value = getattr(getattr(spec, section), key)
+        changes[title.format(value), change] = spec.alter(**{section: {key: factor * value + added}}), key in PARAMETERS
+    return changes
 
 
 def cost_of_assumptions(spec: SensorSpec, *, progress: Step | None = None) -> list[AssumptionCost]:
@@ -126,10 +121,10 @@ def cost_of_assumptions(spec: SensorSpec, *, progress: Step | None = None) -> li
         return np.array(fits) * SIZES
 
     own, rest_px = estimate(moved[len(grid) :]), project_rest(spec, Form.RAW)  # the table's error, with the right numbers
-    for (assumed, change), (other, held) in changes.items():
+    for (assumed, change), (other, moves_pins) in changes.items():
         try:
-            if held:  # the others leave the pins at rest where they are seen
-                other, _ = fit_camera(other, rest_px, free=tuple(key for key in FREE if key != held), named=True)
+            if moves_pins:  # the others leave the pins at rest where they are seen
+                other, _ = fit_camera(other, rest_px, named=True)
             depth, tilt = ((estimate(displacements(other, PROBES)) - own) * np.sign(truth)).T
         except (ContactError, FrameError):
             continue

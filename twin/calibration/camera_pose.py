@@ -234,18 +234,10 @@ def _fit_camera(
     values = start
     for _ in range(ROUNDS):
         before = order
-        fit = least_squares(
-            residual,
-            np.clip(values, low, high),
-            slopes,
-            (low, high),
-            x_scale=ranges,
-            loss="soft_l1",
-            f_scale=ROBUST_PX,
-            max_nfev=MOST_STEPS,
-            args=(order,),
-        )
-        values = fit.x
+        first = np.clip(values, low, high)
+        values = least_squares(
+            residual, first, slopes, (low, high), x_scale=ranges, loss="soft_l1", f_scale=ROBUST_PX, max_nfev=MOST_STEPS, args=(order,)
+        ).x
         if rematch:
             order = _assign_caps(pins_px, caps_px(values))
         if np.array_equal(order, before):
@@ -275,13 +267,12 @@ def _list_undetermined(known: dict[str, float], sd: np.ndarray, correlation: np.
     for k, (name, value) in enumerate(known.items()):
         plausible = _range(name, value)
         twins = [f"{names[j]} ({correlation[k, j]:+.3f})" for j in range(len(names)) if j != k and abs(correlation[k, j]) > CORRELATED]
-        unsure = sd[k] > UNSURE * plausible
-        if not twins and not unsure:
-            continue
         why = [f"its effect is that of {', '.join(twins)} (correlation)"] if twins else []
-        why += [f"its standard deviation would be {sd[k]:.2g}, of a plausible range of {plausible:.2g}"] if unsure else []
-        doubtful[name] = (
-            f"{name} is not determined by this no-contact frame: {'; '.join(why)}. "
-            f"It keeps the specification's {value:g}; to determine it, also give {PARAMETERS[name].instead}"
-        )
+        if sd[k] > UNSURE * plausible:
+            why.append(f"its standard deviation would be {sd[k]:.2g}, of a plausible range of {plausible:.2g}")
+        if why:
+            doubtful[name] = (
+                f"{name} is not determined by this no-contact frame: {'; '.join(why)}. "
+                f"It keeps the specification's {value:g}; to determine it, also give {PARAMETERS[name].instead}"
+            )
     return doubtful

@@ -103,12 +103,11 @@ def register_files(
 ) -> tuple[SensorSpec, PinView]:
     """As ``registered_view``, from pictures; ``pushes`` are texts such as ``x:FRAME``."""
     form = form or open_recording(rest, spec).form
-    sides = {side: path for side, _, path in (text.partition(":") for text in pushes)}
 
     def frame(path: str | Path) -> Frame:
         return open_recording(path, spec, form).read(0)
 
-    pushed = {side: frame(path) for side, path in sides.items()}
+    pushed = {side: frame(path) for side, _, path in (text.partition(":") for text in pushes)}
     return registered_view(spec, frame(rest), pushed, twist=None if twist is None else frame(twist), out=out)
 
 

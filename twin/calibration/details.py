@@ -9,19 +9,14 @@ that moves with the caps belongs to the tiles (the relief). The edges of caps th
 the tiles are fitted to all pixels, also to those that have a background.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-
 import numpy as np
-from scipy import sparse
 
 from scenes.sensor import BackgroundSpec, ReliefSpec, SensorSpec
 from twin.camera.capture import expose
 from twin.evaluation.pictures.aligned import SATURATED, Aligned, levels_slope, with_changes
-from twin.optics.measured import picture_of
 from twin.optics.relief import POWER, CapLamp, cap_places, tiles_picture
-from twin.optics.static_layer import BACKGROUND_POWER
-from twin.types import BoolArray, FloatArray, IntArray
+from twin.optics.static_layer import BACKGROUND_POWER, picture_of
+from twin.types import FloatArray
 
 CELLS, REACH = 23, 1.8
 """Cells along a tile's side, and half of that side, cap radii. A cell is a little narrower than a pixel, and tiles of neighbours meet."""
@@ -43,18 +38,6 @@ LEAST_FRAMES = 2
 """Least number of frames that determine a tile."""
 
 
-@dataclass(frozen=True)
-class _TileView:
-    """A frame, its render, and the places of its pixels on the tiles."""
-
-    image: FloatArray
-    light: FloatArray
-    pixels: IntArray
-    distance: FloatArray
-    weights: sparse.csr_array
-    lamp: FloatArray
-
-
 def fit_details(spec: SensorSpec, frames: list[Aligned], light: list[FloatArray]) -> SensorSpec:
     """The specification with ``housing.background`` and ``appearance.relief``.
 
@@ -66,8 +49,8 @@ def fit_details(spec: SensorSpec, frames: list[Aligned], light: list[FloatArray]
     light : list of (H, W, 3) or (H, W) float
         Rendered light of each frame's state without background and relief.
     """
-    views = list(_views(spec, frames, light))
-    fit = _Fit(spec, views)
+    shine = CapLamp(spec)
+    fit = _Fit(spec, [_TileView(spec, shine, frame, lit) for frame, lit in zip(frames, light, strict=True)])
     fit.improve_background(None)
     tiles = fit.tiles()
     fit.improve_background(tiles)
@@ -85,19 +68,16 @@ def undetermined_tiles(spec: SensorSpec, frames: list[Aligned]) -> int:
     return int((sum(np.isfinite(frame.pins_px).all(axis=1).astype(int) for frame in frames) < LEAST_FRAMES).sum())
 
 
-def _views(spec: SensorSpec, frames: list[Aligned], light: list[FloatArray]) -> Iterator[_TileView]:
-    window, lamp = (0, 0, spec.camera.width_px, spec.camera.height_px), CapLamp(spec)
-    for frame, lit in zip(frames, light, strict=True):
-        places = cap_places(spec.view, spec.pins, frame.state, window, REACH)
-        shines = lamp(frame.state)[places.cap].astype(np.float32)
-        yield _TileView(
-            np.atleast_3d(frame.image).astype(np.float32),
-            np.atleast_3d(lit),
-            places.pixels,
-            np.linalg.norm(places.place, axis=1),
-            places.weights(CELLS, REACH, spec.pins.count),
-            shines if lit.ndim == 3 else shines.mean(axis=1, keepdims=True),
-        )
+class _TileView:
+    """A frame, its render, and the places of its pixels on the tiles."""
+
+    def __init__(self, spec: SensorSpec, shine: CapLamp, frame: Aligned, light: FloatArray) -> None:
+        places = cap_places(spec.view, spec.pins, frame.state, (0, 0, spec.camera.width_px, spec.camera.height_px), REACH)
+        lamp = shine(frame.state)[places.cap].astype(np.float32)
+        self.image, self.light = np.atleast_3d(frame.image).astype(np.float32), np.atleast_3d(light)
+        self.pixels, self.distance = places.pixels, np.linalg.norm(places.place, axis=1)
+        self.weights = places.weights(CELLS, REACH, spec.pins.count)
+        self.lamp = lamp if light.ndim == 3 else lamp.mean(axis=1, keepdims=True)
 
 
 class _Fit:
@@ -108,10 +88,7 @@ class _Fit:
         height, width, channels = views[0].image.shape
         self._mean: FloatArray = np.mean(np.stack([v.light for v in views]), axis=0).reshape(-1, channels)
         self.background = np.zeros_like(self._mean)
-        passed = np.zeros(height * width, bool)
-        for view in views:
-            passed[view.pixels] = True
-        self._passed: BoolArray = passed
+        self._passed = np.isin(np.arange(height * width), np.concatenate([view.pixels for view in views]))
 
     def _light_tiles(self, view: _TileView, tiles: FloatArray | None) -> FloatArray:
         """Light (H W, channels) of a frame's render with background and tiles (N cells^2, channels)."""

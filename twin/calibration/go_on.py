@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scenes.experiment import LABELS, ExperimentSpec
-from scenes.load import list_experiments, load_experiment
+from scenes.load import list_specifications, load_experiment
 from scenes.pins import PinsSpec
 from twin.calibration.new_sensor import LIMIT, NewSensor, new_sensor
 from twin.errors import OptionError
@@ -102,7 +102,8 @@ def whole_sensor(
     FrameError, OptionError
         As ``new_sensor``, ``calibrate_optics`` and ``calibrate_to_file``; or the labels of no experiment vary like the table's.
     """
-    at = frames_at(frames, labels or table, no_contact)
+    table = labels or table
+    at = frames_at(frames, table, no_contact)
     if optics and open_recording(at, form=form).form == Form.PROCESSED:
         raise OptionError(
             f"{frames}: thresholded frames contain nothing about light and colours; leave out `optics`, or give raw camera frames"
@@ -110,15 +111,7 @@ def whole_sensor(
     if labels is not None and experiment is None:
         experiment = experiment_like(open_recording(at, form=form).labels)
     made = new_sensor(
-        frames,
-        out,
-        layout=layout,
-        radius_mm=radius_mm,
-        no_contact=no_contact,
-        table=labels or table,
-        form=form,
-        limit=limit,
-        progress=progress,
+        frames, out, layout=layout, radius_mm=radius_mm, no_contact=no_contact, table=table, form=form, limit=limit, progress=progress
     )
     sensor, light, contact = made.sensor, None, None
     if optics:
@@ -150,13 +143,13 @@ def experiment_like(labels: Mapping[str, np.ndarray]) -> ExperimentSpec:
     OptionError
         The table has no labels of contacts, or no experiment has similar labels.
     """
-    varying = {name for name in LABELS if _varies(labels.get(name))}
+    varying = {name for name in LABELS if name in labels and _varies(numbers(labels[name]))}
     if not varying:
         raise OptionError(
             "no label of a contact varies in the table; expected pose_1..6 and move_1..6, or pose_x..pose_Rz and shear_x..shear_Rz"
         )
     found: list[tuple[float, bool, int, str]] = []
-    for name in list_experiments():
+    for name in list_specifications("experiments"):
         plan = load_experiment(name)
         own = {label for label, (low, high) in plan.ranges().items() if high - low > VARIES}
         # of equally similar experiments, the recorded ones (with a source) come first, then the one with the shortest name
@@ -170,7 +163,6 @@ def experiment_like(labels: Mapping[str, np.ndarray]) -> ExperimentSpec:
     return load_experiment(name)
 
 
-def _varies(cells: np.ndarray | None) -> bool:
-    values = np.zeros(1) if cells is None else numbers(cells)
-    values = values[np.isfinite(values)]
-    return bool(len(values) and np.ptp(values) > VARIES)
+def _varies(values: np.ndarray) -> bool:
+    known = values[np.isfinite(values)]
+    return bool(len(known) and np.ptp(known) > VARIES)

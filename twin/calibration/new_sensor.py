@@ -1,6 +1,8 @@
 """Makes a specification from the frames of an unknown sensor: layout, pins at rest, camera and pin detection."""
 
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,7 @@ from scenes.layouts.base import LatticeLayout
 from scenes.pins import PinsSpec
 from scenes.sensor import AppearanceSpec, BlobSpec, CameraSpec, PipelineSpec, Polarity, SensorSpec
 from twin.calibration.assumptions import AssumptionCost, cost_of_assumptions
-from twin.calibration.camera_pose import LEAST_PINS, MODEL_PX, CameraReport, fit_camera
+from twin.calibration.camera_pose import FREE, LEAST_PINS, MODEL_PX, CameraReport, fit_camera
 from twin.calibration.sensor_file import sibling_folder, write_sensor
 from twin.calibration.size import of_radius, require_radius
 from twin.errors import FrameError, format_count
@@ -29,7 +31,7 @@ from twin.pins.labelling.rest import Rest, rest_of, turn_of
 from twin.pins.pipeline import Pipeline
 from twin.progress import Progress, silent, stage
 from twin.report.page import Page, PagePicture
-from twin.report.table import number
+from twin.report.table import Column
 from twin.store import output, write_text, writes_file
 from twin.types import Form, Frame
 
@@ -46,10 +48,9 @@ SHOWN_FRAMES = 4
 PINHOLE_MM, FISHEYE_MM = 45.0, 7.5
 """Distance of the pupil from the centre of a dome of 20 mm, mm, at the start of a fit. The values are those of two TacTip cameras, without
 and with a wide-angle lens."""
-FITTED_PINHOLE = ("fx_px", "cx_px", "cy_px", "k1", "tilt_x_deg", "tilt_y_deg", "phase_deg")
-"""Parameters of a pinhole camera that pins at rest may determine (see ``twin.calibration.camera_pose``)."""
-FITTED_FISHEYE = (*FITTED_PINHOLE, "k2")
-"""Parameters of a fisheye camera that pins at rest may determine. Its distortion has a second coefficient."""
+FITTED = {"perspective": FREE, "fisheye": (*FREE, "k2")}
+"""Parameters that pins at rest may determine (see ``twin.calibration.camera_pose``), by the lens: the distortion of a fisheye has a second
+coefficient."""
 UNTUNED_OFFSET = -12.0
 """Threshold, gray levels above the local mean, for raw frames if only thresholded frames of the sensor were given."""
 BETTER = 0.85
@@ -156,7 +157,7 @@ class NewSensor:
 
     def lines(self) -> list[str]:
         """The results and the doubts about them, as lines of text."""
-        lines = [f"{'sure' if self.identified.sure else 'unsure'}: {self.identified.best.line()}"]
+        lines = [f"layout {'sure' if self.identified.sure else 'unsure'}: {self.identified.best.line()}"]
         lines += [f"doubt: {doubt}" for doubt in self.identified.doubts]
         if not self.identified.sure:
             lines += [f"or: {other.line()}" for other in self.identified.candidates[1:2]]
@@ -249,8 +250,8 @@ def new_sensor(
         judged = looked if limit >= min(JUDGED, len(recording)) else evenly_read(recording, JUDGED)
         odd = list(dict.fromkeys([*odd, *recording.notes(), *_doubtful(camera, rest, len(looked))]))
         health, pictures = _health(sensor, looked[0].form, judged, folder)
-        size = _size(sensor, given=radius_mm is not None)
-        known, assumed, steps = _describe_result(sensor, found, rest, camera, others, tuned, health, recording, out)
+        known, assumed = _list_known(sensor, found, rest, camera, others, tuned), _list_assumed(sensor, found, camera)
+        steps, size = _list_steps(sensor, found, rest, health, recording, out), _size(sensor, given=radius_mm is not None)
         known, assumed = ((*known, size), assumed) if radius_mm is not None else (known, (size, *assumed))
         write_sensor(out, sensor, _comment(frames.name, found, rest), _notes(found, rest, camera))
         _write_pins(folder / FOUND_PINS, best, (sensor.camera.cx_px, sensor.camera.cy_px))
@@ -278,17 +279,12 @@ def _compare_layout(layout: PinsSpec, images: list[np.ndarray]) -> Identified:
             shown, polarity = dark, "dark"
     other: Candidate | None = None
     if shown is None or shown.explained < (GIVEN_SHOWN if alone else SURE_EXPLAINED):
-        try:
+        with suppress(FrameError):
             other = identify(images).best
-        except FrameError:
-            other = None
-    ahead = other is not None and shown is not None and other.explained > shown.explained + SURE_AHEAD
-    if shown is not None and shown.explained >= GIVEN_SHOWN and not ahead:
+    if shown is not None and shown.explained >= GIVEN_SHOWN and (other is None or other.explained <= shown.explained + SURE_AHEAD):
+        missing = f"px is none of the {layout.in_words()}: is its position missing in the file?"
         forgotten = unnamed_spots(shown.rest_px, shown.seen) if alone else []
-        doubts = tuple(
-            f"a pin-like spot at ({x:.0f}, {y:.0f}) px is none of the {layout.in_words()}: is its position missing in the file?"
-            for x, y in forgotten
-        )
+        doubts = tuple(f"a pin-like spot at ({x:.0f}, {y:.0f}) {missing}" for x, y in forgotten)
         return Identified((shown,), not doubts, doubts, 0.0, polarity)
     if shown is None or shown.explained < LEAST_SHOWN:
         instead = f"; they show {other.pins.in_words()}" if other is not None else ""
@@ -313,17 +309,9 @@ def _start_specification(name: str, frame: Frame, pins: PinsSpec, rest: Rest, so
     seen = rest.pins_px[np.isfinite(rest.pins_px[:, 0])]
     x, y = ((seen.max(axis=0) + seen.min(axis=0)) / 2).tolist()
     radius = float(np.linalg.norm(seen - [x, y], axis=1).max())
-    turned = pins.alter(phase_deg=round(turn_of(pins, rest.pins_px), 2))
-    focal = radius * PINHOLE_MM / 17.0  # the outermost caps of a TacTip are about 17 mm from the axis
+    f = radius * PINHOLE_MM / 17.0  # the outermost caps of a TacTip are about 17 mm from the axis
     camera = CameraSpec(
-        width_px=width,
-        height_px=height,
-        channels="color" if color else "mono",
-        fx_px=focal,
-        fy_px=focal,
-        cx_px=x,
-        cy_px=y,
-        distance_mm=PINHOLE_MM,
+        width_px=width, height_px=height, channels="color" if color else "mono", fx_px=f, fy_px=f, cx_px=x, cy_px=y, distance_mm=PINHOLE_MM
     )
     anywhere = BlobSpec(
         polarity=polarity, threshold=UNKNOWN_OFFSET, threshold_block_px=UNKNOWN_BLOCK_PX, mask_center_px=(x, y), mask_radius_px=1.1 * radius
@@ -333,7 +321,7 @@ def _start_specification(name: str, frame: Frame, pins: PinsSpec, rest: Rest, so
         name=name,
         description=f"Made by 'twin new' from frames of {source}",
         source="Layout, camera and pin detection: the frames. All else: the defaults of a printed TacTip",
-        pins=turned,
+        pins=pins.alter(phase_deg=round(turn_of(pins, rest.pins_px), 2)),
         camera=camera,
         appearance=DARK_CAPS if polarity == "dark" else AppearanceSpec(),
         recording=whole_recording((width, height), (width, height), polarity) if thresholded else None,
@@ -377,15 +365,13 @@ def _camera(
     sd_px = MODEL_PX if source != "made" else max(MODEL_PX, MADE_SD * usual_spacing(pins_px))
     tried: list[tuple[float, SensorSpec, CameraReport]] = []
     best = 0
-    for projection, spacing in (("perspective", "polar"), ("perspective", "plan"), ("fisheye", "polar"), ("fisheye", "plan")):
-        pins = start.pins.alter(spacing=spacing)
-        camera = start.camera
+    for (projection, free), spacing in product(FITTED.items(), ("polar", "plan")):
+        trial = start.alter(pins={"spacing": spacing}, camera={"projection": projection})
         if projection == "fisheye":
-            focal = camera.fx_px * FISHEYE_MM / PINHOLE_MM
-            camera = camera.alter(projection=projection, fx_px=focal, fy_px=focal, distance_mm=camera.distance_mm * FISHEYE_MM / PINHOLE_MM)
-        trial = start.alter(pins=pins, camera=camera)
+            nearer = {key: getattr(start.camera, key) * FISHEYE_MM / PINHOLE_MM for key in ("fx_px", "fy_px", "distance_mm")}
+            trial = trial.alter(camera=nearer)
         trial = trial.alter(camera=camera_seeing(trial, pins_px, np.flatnonzero(np.isfinite(pins_px[:, 0]))))
-        fitted, report = fit_camera(trial, pins_px, free=FITTED_FISHEYE if projection == "fisheye" else FITTED_PINHOLE, named=True)
+        fitted, report = fit_camera(trial, pins_px, free=free, named=True)
         fitted, uneven = _with_sizes(fitted, sizes_px)
         misfit = float(np.hypot(report.rms_px / sd_px, uneven / SIZE_SD))
         tried.append((misfit, fitted, report))
@@ -445,24 +431,17 @@ def _health(sensor: SensorSpec, form: Form, frames: list[Frame], folder: Path) -
     steadily = np.flatnonzero(lost_in_view(seen, pipeline)[0].mean(axis=0) >= STEADILY_LOST)
     reasons = list(dict.fromkeys(o.reason.split(":")[0] for o in seen if not o.valid))
     first = [next(f"{f.name}: {o.reason}" for f, o in zip(frames, seen, strict=True) if o.reason.startswith(r)) for r in reasons]
-    health = Health(
-        len(seen),
-        float(np.mean([o.complete for o in seen])),
-        float(np.mean([o.found / max(o.expected, 1) for o in seen])),
-        float(np.mean([o.valid for o in seen])),
-        float(np.median([len(o.extra_px) for o in seen])),
-        tuple(steadily.tolist()),
-        tuple(first[:3]),
-    )
-    worst = np.argsort([o.found / max(o.expected, 1) for o in seen], kind="stable")
+    found = [o.found / max(o.expected, 1) for o in seen]
+    whole, mean, valid = (float(np.mean(share)) for share in ([o.complete for o in seen], found, [o.valid for o in seen]))
+    extra = float(np.median([len(o.extra_px) for o in seen]))
+    worst = np.argsort(found, kind="stable")
     chosen = dict.fromkeys([int(worst[-1]), int(worst[0]), *worst[:: max(len(worst) // SHOWN_FRAMES, 1)].tolist()])
-    pictures: list[Path] = []
     scale = int(np.clip(round(900 / max(pipeline.size_px)), 1, 6))  # pins can be seen well
-    for k in list(chosen)[:SHOWN_FRAMES]:
-        path = folder / f"overlay-{len(pictures) + 1}.png"
-        write_image(path, draw_overlay(frames[k], seen[k], scale=scale, numbers=True))
-        pictures.append(path)
-    return health, pictures
+    pictures = [
+        write_image(folder / f"overlay-{number}.png", draw_overlay(frames[k], seen[k], scale=scale, numbers=True))
+        for number, k in enumerate(list(chosen)[:SHOWN_FRAMES], 1)
+    ]
+    return Health(len(seen), whole, mean, valid, extra, tuple(steadily.tolist()), tuple(first[:3])), pictures
 
 
 def _doubtful(camera: CameraReport, rest: Rest, frames: int) -> list[str]:
@@ -485,20 +464,12 @@ def _doubtful(camera: CameraReport, rest: Rest, frames: int) -> list[str]:
     return notes
 
 
-def _describe_result(
-    sensor: SensorSpec,
-    found: Identified,
-    rest: Rest,
-    camera: CameraReport,
-    other_cameras: tuple[str, ...],
-    tuned: Tuned,
-    health: Health,
-    recording: Recording,
-    out: Path,
-) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """What the frames determine, what is assumed, and how to find out more. The specification is written to ``out``."""
-    evidence, blob = tuned.detector.evidence, blob_spec(sensor.pipeline, recording.form)
-    known = (
+def _list_known(
+    sensor: SensorSpec, found: Identified, rest: Rest, camera: CameraReport, other_cameras: tuple[str, ...], tuned: Tuned
+) -> tuple[str, ...]:
+    """What the frames determine."""
+    evidence, blob = tuned.detector.evidence, blob_spec(sensor.pipeline, tuned.detector.form)
+    return (
         f"Layout: {found.best.line()}",
         rest.line(),
         *([] if found.polarity == "bright" else ["polarity: the pins are darker than the skin"]),
@@ -512,7 +483,11 @@ def _describe_result(
             else f"threshold {blob.threshold:g}, which may change by {evidence.threshold_slack if evidence else 0:g} gray levels"
         ),
     )
-    assumed = [
+
+
+def _list_assumed(sensor: SensorSpec, found: Identified, camera: CameraReport) -> tuple[str, ...]:
+    """What is assumed."""
+    return (
         f"Outermost pins at {sensor.pins.max_polar_deg:g} deg from the axis, and the camera's distance {sensor.camera.distance_mm:.1f} mm: "
         "pins at rest fit many pairs of them.",
         "Stiffness of skin and gel: Shore A 26 to 30 rubber and a soft gel.",
@@ -520,7 +495,11 @@ def _describe_result(
         if found.polarity == "bright"
         else "Light, noise: those of another TacTip; a gray skin and black caps ([appearance]).",
         *camera.held.values(),
-    ]
+    )
+
+
+def _list_steps(sensor: SensorSpec, found: Identified, rest: Rest, health: Health, recording: Recording, out: Path) -> tuple[str, ...]:
+    """How to find out more. The specification is written to ``out``."""
     steps = []
     if not found.sure:
         layouts = ", or ".join(candidate.pins.in_words() for candidate in found.candidates[:2])
@@ -545,7 +524,7 @@ def _describe_result(
         steps.append("or record labelled contacts (a table targets.csv beside the frames), then 'twin calibrate contact' and 'twin train'")
     if sensor.camera.channels == "color" and recording.form is Form.RAW and found.polarity == "bright":
         steps.append(f"fit light and colours: twin calibrate optics {files}")
-    return known, tuple(assumed), tuple(steps)
+    return tuple(steps)
 
 
 def _size(sensor: SensorSpec, *, given: bool) -> str:
@@ -573,12 +552,10 @@ def _write_pins(path: Path, layout: Candidate, axis_px: tuple[float, float]) -> 
 
 def _comment(source: str, found: Identified, rest: Rest) -> str:
     """Lines above the specification."""
-    return "\n".join(
-        (
-            f"Made by 'twin new' from frames of {source}. Sections and keys that are not here have their defaults: a printed TacTip",
-            "(docs/your-own-sensor.md). The page beside this file states what is known, what is assumed, and how to find out more.",
-            f"Layout: {'sure' if found.sure else 'UNSURE'}. {rest.line()}.",
-        )
+    return (
+        f"Made by 'twin new' from frames of {source}. Sections and keys that are not here have their defaults: a printed TacTip\n"
+        "(docs/your-own-sensor.md). The page beside this file states what is known, what is assumed, and how to find out more.\n"
+        f"Layout: {'sure' if found.sure else 'UNSURE'}. {rest.line()}."
     )
 
 
@@ -615,13 +592,9 @@ def _write_page(path: Path, made: NewSensor, pictures: list[Path]) -> None:
         "By simulation: how far an estimated depth, and an estimated tilt of 5 deg, move if one of the assumed numbers is wrong. The first "
         "number is the first to measure.",
     )
-    page.table(
-        [
-            {"assumed": c.assumed, "change": c.change, "depth": f"{100 * c.depth_share:+.0f} %", "tilt": f"{c.tilt_deg:+.1f} deg"}
-            for c in made.costs
-        ],
-        ["assumed", "change", "depth", "tilt"],
-    )
+    depth = Column("depth_share", "depth", "%", decimals=0, signed=True, scale=100)
+    tilt = Column("tilt_deg", "tilt", "deg", decimals=1, signed=True)
+    page.table([vars(cost) for cost in made.costs], ["assumed", "change", depth, tilt])
     page.section("How to find out more")
     page.items(made.next_steps)
     page.section(
@@ -629,19 +602,10 @@ def _write_page(path: Path, made: NewSensor, pictures: list[Path]) -> None:
     )
     page.figures(*(PagePicture(path, f"Frame with its pins, {path.stem}", "", kind="photo") for path in pictures))
     page.section("Layouts that were considered")
+    shares = [Column(key, key, "%", decimals=decimals, scale=100) for key, decimals in (("explained", 1), ("agreeing", 0))]
     page.table(
-        [
-            {
-                "layout": candidate.pins.in_words(),
-                "explained": f"{100 * candidate.explained:.1f} %",
-                "agreeing": f"{100 * candidate.agreeing:.0f} %",
-                "not_seen": number(candidate.not_seen, 3),
-                "left_over": number(candidate.left_over, 3),
-                "misfit": number(candidate.misfit, 2),
-            }
-            for candidate in made.identified.candidates
-        ],
-        ["layout", "explained", "agreeing", "not_seen", "left_over", "misfit"],
+        [vars(candidate) | {"layout": candidate.pins.in_words()} for candidate in made.identified.candidates],
+        ["layout", *shares, "not_seen", "left_over", Column("misfit", "misfit", digits=2)],
         caption="Explained: of the pins in view and the pin-like spots, the share that belong together (median). Misfit: distance of the "
         "pins at rest from a smooth view of the layout, in spacings.",
     )

@@ -6,7 +6,7 @@ and after the fit, the remaining differences, and the changed values.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +17,7 @@ from twin.calibration.details import fit_details, undetermined_tiles
 from twin.calibration.light.caps import fit_caps
 from twin.calibration.light.photometry import fit_photometry
 from twin.calibration.light.response import fit_blur, fit_focus, fit_haze, fit_noise, fit_response, sharpness
-from twin.calibration.light.rim import fit_rim
-from twin.calibration.light.ring import NoRing
+from twin.calibration.light.ring import NoRing, fit_rim
 from twin.calibration.light.surroundings import fit_surroundings
 from twin.calibration.sensor_file import sibling_folder, write_sensor
 from twin.camera.capture import expose
@@ -133,20 +132,18 @@ class OpticsCalibration(ReadableResult):
 class _Studio:
     """Renders the states of frames with different specifications."""
 
-    def __init__(self, bar: Bar) -> None:
-        self._bar = bar
+    def __init__(self, frames: list[Aligned], bar: Bar) -> None:
+        self._frames, self._bar = frames, bar
 
-    def light(self, spec: SensorSpec, frames: list[Aligned], title: str) -> list[np.ndarray]:
+    def light(self, spec: SensorSpec, title: str) -> list[np.ndarray]:
         """Linear light (H, W[, channels]) of every frame's state."""
-        renderer, light = Renderer(spec, spp=SAMPLES), []
+        renderer = Renderer(spec, spp=SAMPLES)
         with self._bar(title) as progress:
-            for seed, frame in enumerate(report_each(frames, progress)):
-                light.append(renderer.render(frame.state, seed=seed))
-        return light
+            return [renderer.render(frame.state, seed=seed) for seed, frame in enumerate(report_each(self._frames, progress))]
 
-    def shots(self, spec: SensorSpec, frames: list[Aligned], title: str) -> list[np.ndarray]:
+    def shots(self, spec: SensorSpec, title: str) -> list[np.ndarray]:
         """Renders (H, W[, 3]) uint8 of every frame's state, captured without noise."""
-        return [expose(light, spec.capture) for light in self.light(spec, frames, title)]
+        return [expose(light, spec.capture) for light in self.light(spec, title)]
 
 
 @writes_file(".*.csv", ".*.uri")
@@ -223,7 +220,7 @@ def fit_optics(
     log = _Log(work, spec, raw)
     with bar("fit the skin to the pins") as step:
         frames = log.align_frames(spec, raw, step)
-    inside, studio = lens_disc(spec.view, spec.housing).inside, _Studio(bar)
+    inside, studio = lens_disc(spec.view, spec.housing).inside, _Studio(frames, bar)
     if unseen := undetermined_tiles(spec, frames):
         notes.append(f"the relief of {unseen} of {spec.pins.count} caps: fewer than two frames show them; use more frames")
     if len(frames) < FEW_FRAMES_FITTED:
@@ -232,14 +229,14 @@ def fit_optics(
         )
     if spec.pipeline.raw.rest_origin == "contacts":
         notes.append(REST_MADE)
-    first = studio.shots(spec, frames, "render the start")
+    first = studio.shots(spec, "render the start")
     spec = with_changes(without(spec, DETAILS), response={"residual": None})  # the residual network was trained for the old calibration
     held = spec.housing
     for number, fit in enumerate(_stages(frames, inside, studio, bar)):
         spec = log.stage(f"{number:02d}-{fit.__name__}", fit, spec)
         if number == 0 and spec.housing == held:
             notes.append(RING_HELD)
-    last = studio.shots(spec, frames, "render the result")
+    last = studio.shots(spec, "render the result")
     before, after = (_mean_figures(frames, shots, inside) for shots in (first, last))
     return Calibration(spec, before, after, notes, frames, first, last)
 
@@ -260,28 +257,27 @@ def _stages(frames: list[Aligned], inside: np.ndarray, studio: _Studio, bar: Bar
             return fit_photometry(spec, frames, step)
 
     def defocus(spec: SensorSpec) -> SensorSpec:
-        shots = studio.shots(spec, frames, "render for the sharpness")
-        return fit_focus(spec, sharpness(spec, frames, shots))
+        return fit_focus(spec, sharpness(spec, frames, studio.shots(spec, "render for the sharpness")))
 
     def response(spec: SensorSpec) -> SensorSpec:
-        light = studio.light(spec, frames, "render for the response")
+        light = studio.light(spec, "render for the response")
         return fit_blur(fit_response(spec, frames, light, inside), frames, light)
 
     def caps(spec: SensorSpec) -> SensorSpec:
-        return fit_caps(spec, frames, lambda s, f: studio.shots(s, f, "render for the caps"))
+        return fit_caps(spec, frames, studio.shots(spec, "render for the caps"))
 
     def rim(spec: SensorSpec) -> SensorSpec:
-        return fit_rim(spec, frames, studio.light(spec, frames, "render for the rim"))
+        return fit_rim(spec, frames, studio.light(spec, "render for the rim"))
 
     def details(spec: SensorSpec) -> SensorSpec:
-        return fit_details(spec, frames, studio.light(without(spec, DETAILS), frames, "render for relief and background"))
+        return fit_details(spec, frames, studio.light(without(spec, DETAILS), "render for relief and background"))
 
     def detailed_response(spec: SensorSpec) -> SensorSpec:
-        light = studio.light(spec, frames, "render for the response to details")
+        light = studio.light(spec, "render for the response to details")
         return fit_response(fit_haze(spec, frames, light, inside), frames, light, inside)
 
     def noise(spec: SensorSpec) -> SensorSpec:
-        return fit_noise(spec, frames, studio.light(spec, frames, "render for the noise"))
+        return fit_noise(spec, frames, studio.light(spec, "render for the noise"))
 
     smooth = [surroundings, photometry, caps, response, defocus, *[caps, response] * (CAP_ROUNDS - 1), rim]
     return [*smooth, details, *[detailed_response, details] * DETAIL_ROUNDS, noise]
@@ -295,8 +291,6 @@ def _mean_figures(frames: list[Aligned], shots: list[np.ndarray], inside: np.nda
 
 def _pins_at_rest(path: Path, spec: SensorSpec) -> np.ndarray:
     """Pins (N, 2) of a raw frame without contact."""
-    if not path.is_file():
-        raise FrameError(f"{path}: no such frame")
     image, _ = read_image(path)
     observation = Pipeline(spec, Form.RAW)(Frame(image, Form.RAW, path.name))
     if not observation.valid:
@@ -313,13 +307,10 @@ class _Log:
 
     def align_frames(self, spec: SensorSpec, raw: list[tuple[str, np.ndarray, np.ndarray]], progress: Step) -> list[Aligned]:
         """Frames with their fitted skin, read from disk if it was stored. ``raw`` holds names, images, and pins (N, 2) px."""
-        fit: SkinFit | None = None
-        frames = []
+        skin, frames = cache(partial(SkinFit, spec)), []  # takes seconds to build, and is not needed if all frames were stored
 
         def fit_skin(pins_px: np.ndarray) -> dict[str, np.ndarray]:
-            nonlocal fit
-            fit = fit or SkinFit(spec)  # takes seconds to build, and is not needed if all frames were stored
-            return vars(fit(pins_px))
+            return vars(skin()(pins_px))
 
         for name, image, pins_px in report_each(raw, progress):
             item = Item(f"skin-{Path(name).stem}", (SkinFit,), [spec, pins_px])
@@ -334,24 +325,23 @@ class _Log:
 
 
 def write_page(out: Path, start: SensorSpec, found: Calibration, source: str) -> Path:
-    """Write ``index.html`` and its pictures to the folder ``out``, and return the page's path."""
-    rows = _write_pictures(out / "pictures", found)
-    lead = (
-        f"{format_count(len(rows), 'frames')} of {source}. Figures: over the lens disc, renders without noise, the skin fitted to the pins."
-    )
+    """Write ``index.html`` and its pictures (of each frame those of ``KINDS``) to the folder ``out``, and return the page's path."""
+    count = format_count(len(found.frames), "frames")
+    lead = f"{count} of {source}. Figures: over the lens disc, renders without noise, the skin fitted to the pins."
     page = Page(f"Calibration of {found.spec.name}", "twin calibrate", topic="TacTip twin: calibration", lead=lead)
-    figures: list[dict[str, object]] = [{"of": "before", **found.before}, {"of": "after", **found.after}]
     page.notice("Worse than before the fit", found.warnings, tone="bad")
-    page.table(figures, [Column("of", ""), *image_columns(mark_best=True)])
+    page.table([{"of": "before", **found.before}, {"of": "after", **found.after}], [Column("of", ""), *image_columns(mark_best=True)])
     if found.notes:
         page.section("What these frames do not determine")
         page.items(found.notes)
     page.section("Frames")
-    for name, pictures in rows:
-        shown = [
-            PagePicture(pictures[k], f"{name}: {comment}", f"{name}, {comment}" if k == "real" else comment, "frame")
-            for k, comment in KINDS.items()
-        ]
+    (out / "pictures").mkdir(parents=True, exist_ok=True)
+    stems = distinct_stems([frame.name for frame in found.frames])
+    for stem, frame, before, after in zip(stems, found.frames, found.first, found.last, strict=True):
+        shown = []
+        for (kind, comment), image in zip(KINDS.items(), (frame.image, before, after, difference_picture(frame.image, after)), strict=True):
+            path, caption = out / "pictures" / f"{stem}-{kind}.png", f"{frame.name}, {comment}" if kind == "real" else comment
+            shown.append(PagePicture(write_image(path, image), f"{frame.name}: {comment}", caption, "frame"))
         page.figures(*shown, layout="row")
     page.section("What changed")
     changed = [{**change, "name": code(change["name"])} for change in _changes(start, found.spec)]
@@ -359,28 +349,16 @@ def write_page(out: Path, start: SensorSpec, found: Calibration, source: str) ->
     return page.write(out / "index.html")
 
 
-def _write_pictures(folder: Path, found: Calibration) -> list[tuple[str, dict[str, Path]]]:
-    """Write four pictures of each frame (see ``KINDS``). Returns the frame's name, and the pictures' paths by kind."""
-    folder.mkdir(parents=True, exist_ok=True)
-    rows, stems = [], distinct_stems([frame.name for frame in found.frames])
-    for stem, frame, before, after in zip(stems, found.frames, found.first, found.last, strict=True):
-        images = {"real": frame.image, "before": before, "after": after, "residual": difference_picture(frame.image, after)}
-        rows.append((frame.name, {kind: write_image(folder / f"{stem}-{kind}.png", image) for kind, image in images.items()}))
-    return rows
-
-
-def _changes(before: SensorSpec, after: SensorSpec) -> list[dict]:
+def _changes(before: SensorSpec, after: SensorSpec) -> list[dict[str, str]]:
     """All values that differ: ``name`` is section.key, ``before`` and ``after`` are texts."""
     old, new = before.model_dump(), after.model_dump()
-    found = []
-    for section, values in new.items():
-        if isinstance(values, dict):
-            found += [
-                {"name": f"{section}.{key}", "before": _format_value(old[section][key]), "after": _format_value(value)}
-                for key, value in values.items()
-                if old[section] is not None and old[section][key] != value
-            ]
-    return found
+    return [
+        {"name": f"{section}.{key}", "before": _format_value(old[section][key]), "after": _format_value(value)}
+        for section, values in new.items()
+        if isinstance(values, dict) and old[section] is not None
+        for key, value in values.items()
+        if old[section][key] != value
+    ]
 
 
 def _format_value(value: object) -> str:

@@ -29,7 +29,7 @@ def of_radius(spec: SensorSpec, radius_mm: float) -> SensorSpec:
         The radius lies outside of ``RADII_MM``.
     """
     require_radius(radius_mm)
-    return spec.model_validate(_scale_section(spec, radius_mm / spec.skin.outer_radius_mm))
+    return spec.model_validate(_scale("", spec, radius_mm / spec.skin.outer_radius_mm))
 
 
 def require_radius(radius_mm: float) -> None:
@@ -39,16 +39,12 @@ def require_radius(radius_mm: float) -> None:
         raise OptionError(f"radius {radius_mm:g} mm: give the radius of the tip's dome, {least:g} to {most:g} mm (a TacTip has 20)")
 
 
-def _scale_section(section: BaseModel, factor: float) -> dict[str, Any]:
-    """A section's values, lengths multiplied."""
-    return {name: _value(name, value, factor) for name, value in section}
-
-
-def _value(name: str, value: Any, factor: float) -> Any:
+def _scale(name: str, value: Any, factor: float) -> Any:
+    """A value with this name, or all those of a section, lengths multiplied."""
     if isinstance(value, BaseModel):
-        return _scale_section(value, factor)
+        return {key: _scale(key, part, factor) for key, part in value}
     if isinstance(value, tuple):
-        return tuple(_value(name, each, factor) for each in value)
+        return tuple(_scale(name, each, factor) for each in value)
     if isinstance(value, int | float) and not isinstance(value, bool):
         if name.endswith("_per_mm"):
             return value / factor

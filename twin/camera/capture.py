@@ -70,33 +70,28 @@ def expose(
     (H, W, 3) or (H, W) uint8
     """
     response = capture.response
-    if response.residual is not None and response.residual.used and np.ndim(linear) == 3:
-        gray = before_stream(linear, capture, rng, origin_px=origin_px)
-        gray = refine(gray, response.residual, luma_weights(response.stream), response.chroma_columns, rng, origin_px)
-    else:
-        gray = _developed_light(linear, capture, response, rng, origin_px)
+    residual = response.residual if response.residual is not None and response.residual.used and np.ndim(linear) == 3 else None
+    gray = before_stream(linear, capture, rng, origin_px=origin_px, columns=1 if residual else response.chroma_columns)
+    if residual is not None:
+        gray = refine(gray, residual, luma_weights(response.stream), response.chroma_columns, rng, origin_px)
     frame = through_stream(gray, response.stream) if gray.ndim == 3 else np.clip(np.rint(gray), 0, 255).astype(np.uint8)
     return compressed(frame, response.jpeg_quality, origin_px)
 
 
 def before_stream(
-    linear: FloatArray, capture: CaptureSpec, rng: np.random.Generator | None = None, *, origin_px: tuple[int, int] = (0, 0)
+    linear: FloatArray, capture: CaptureSpec, rng: np.random.Generator | None, *, origin_px: tuple[int, int] = (0, 0), columns: int = 1
 ) -> FloatArray:
-    """Gray levels (H, W[, 3]) float before columns share colour differences and a stream rounds them; parameters as for ``expose``."""
-    return _developed_light(linear, capture, capture.response.alter(chroma_columns=1), rng, origin_px)
+    """Gray levels (H, W[, 3]) float after gel, lens, noise and response curve, before a stream rounds them; parameters as for ``expose``.
 
-
-def _developed_light(
-    linear: FloatArray, capture: CaptureSpec, response: ResponseSpec, rng: np.random.Generator | None, origin_px: tuple[int, int]
-) -> FloatArray:
-    """Gray levels of light after gel, lens, noise and response curve."""
-    camera = capture.camera
+    Groups of ``columns`` columns share colour differences.
+    """
+    camera, response = capture.camera, capture.response
     light = hazed(np.asarray(linear, np.float32), capture.gel)
     light = dispersed(light, camera, origin_px)
     light = blurred(light, response.blur_sigma_px)
     light = vignetted(light, camera, origin_px)
     light = amplified(light, response, rng)
-    return developed(light, noisy(light, response, rng), response, origin_px)
+    return developed(light, noisy(light, response, rng), response, columns, origin_px)
 
 
 def hazed(light: FloatArray, gel: GelSpec) -> FloatArray:
@@ -108,14 +103,12 @@ def hazed(light: FloatArray, gel: GelSpec) -> FloatArray:
 
 def dispersed(light: FloatArray, camera: CameraSpec, origin_px: tuple[int, int] = (0, 0)) -> FloatArray:
     """Lateral chromatic aberration: ``red'(c + scale (p - c) + shift) = red(p)`` with c the principal point; blue alike."""
-    own = {0: (camera.red_scale, camera.red_shift_px), 2: (camera.blue_scale, camera.blue_shift_px)}
-    if light.ndim == 2 or all(scale == 1 and not any(shift) for scale, shift in own.values()):
-        return light
-    light = light.copy()
-    for channel, (scale, shift) in own.items():
-        if scale != 1 or any(shift):
-            across = _scaled(np.ascontiguousarray(light[..., channel].T), scale, camera.cx_px - origin_px[0], shift[0])
-            light[..., channel] = _scaled(np.ascontiguousarray(across.T), scale, camera.cy_px - origin_px[1], shift[1])
+    own = ((0, camera.red_scale, camera.red_shift_px), (2, camera.blue_scale, camera.blue_shift_px))
+    moved = [(channel, scale, shift) for channel, scale, shift in own if light.ndim == 3 and (scale != 1 or any(shift))]
+    light = light.copy() if moved else light
+    for channel, scale, shift in moved:
+        across = _scaled(np.ascontiguousarray(light[..., channel].T), scale, camera.cx_px - origin_px[0], shift[0])
+        light[..., channel] = _scaled(np.ascontiguousarray(across.T), scale, camera.cy_px - origin_px[1], shift[1])
     return light
 
 
@@ -187,7 +180,7 @@ def sharpened(light: FloatArray, response: ResponseSpec) -> FloatArray:
     return light + (mask[..., None] if light.ndim == 3 else mask)
 
 
-def developed(light: FloatArray, grainy: FloatArray, response: ResponseSpec, origin_px: tuple[int, int] = (0, 0)) -> FloatArray:
+def developed(light: FloatArray, grainy: FloatArray, response: ResponseSpec, columns: int, origin_px: tuple[int, int]) -> FloatArray:
     """Gray levels of ``light``, with the noise of ``grainy``: all colours are sharpened by their luma, and colour differences are softened.
 
     The camera does not sharpen the noise. Neighbouring columns of the full frame have the same colour differences.
@@ -195,11 +188,11 @@ def developed(light: FloatArray, grainy: FloatArray, response: ResponseSpec, ori
     gray = curve(sharpened(light, response), response)
     if grainy is not light:
         gray = gray + blurred(curve(grainy, response) - curve(light, response), response.noise_sigma_px)
-    if gray.ndim == 2 or (response.chroma_sigma_px == 0 and response.chroma_median_px == 0 and response.chroma_columns == 1):
+    if gray.ndim == 2 or (response.chroma_sigma_px == 0 and response.chroma_median_px == 0 and columns == 1):
         return gray
     luma = (gray @ luma_weights(response.stream))[..., None]
     soft = cleaned(blurred(gray - luma, response.chroma_sigma_px), response)
-    return shared(soft, response.chroma_columns, origin_px[0]) + luma
+    return shared(soft, columns, origin_px[0]) + luma
 
 
 def cleaned(chroma: FloatArray, response: ResponseSpec) -> FloatArray:

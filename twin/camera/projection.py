@@ -71,13 +71,9 @@ def distort(camera: CameraSpec, xy: FloatArray) -> FloatArray:
         scale = _fisheye(camera, np.arctan(radius)) / np.maximum(radius, 1e-12)
         return xy * np.where(radius > 1e-12, scale, 1.0)[..., None]
     radial = 1 + camera.k1 * r2 + camera.k2 * r2 * r2
-    return np.stack(
-        [
-            x * radial + 2 * camera.p1 * x * y + camera.p2 * (r2 + 2 * x * x),
-            y * radial + camera.p1 * (r2 + 2 * y * y) + 2 * camera.p2 * x * y,
-        ],
-        axis=-1,
-    )
+    across = x * radial + 2 * camera.p1 * x * y + camera.p2 * (r2 + 2 * x * x)
+    down = y * radial + camera.p1 * (r2 + 2 * y * y) + 2 * camera.p2 * x * y
+    return np.stack([across, down], axis=-1)
 
 
 def undistort(camera: CameraSpec, seen: FloatArray, *, guess: FloatArray | None = None) -> FloatArray:
@@ -123,9 +119,10 @@ def project_in_form(spec: SensorSpec, form: Form, points_mm: FloatArray) -> Floa
 
 def window_tangent(view: ViewSpec, rho_mm: FloatArray, z_mm: FloatArray, *, behind_mm: float | None = None) -> FloatArray:
     """Tangent u of the angle in air of the rays from (0, z0) to (rho, z), where z0 is that of the pupil or ``behind_mm``."""
-    heights, indices = _layers(view, z_mm, -view.camera.distance_mm if behind_mm is None else behind_mm)
-    whole = np.broadcast_arrays(np.asarray(rho_mm, float), *heights)
-    return _tangents(*(each.ravel() for each in whole), *indices[1:]).reshape(whole[0].shape)
+    back, front, z = view.lens.back_mm, view.lens.z_mm, np.asarray(z_mm, float)
+    air = np.minimum(z, back) - (-view.camera.distance_mm if behind_mm is None else behind_mm)
+    whole = np.broadcast_arrays(np.asarray(rho_mm, float), air, np.clip(z, back, front) - back, np.maximum(z - front, 0))
+    return _tangents(*(each.ravel() for each in whole), view.lens.refractive_index, view.gel_index).reshape(whole[0].shape)
 
 
 def pixel_rays(view: ViewSpec, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -218,14 +215,6 @@ def _tangents(rho: FloatArray, air: FloatArray, window: FloatArray, gel: FloatAr
         if not moves.any():
             break
     return u
-
-
-def _layers(view: ViewSpec, z_mm: FloatArray, from_mm: float) -> tuple[tuple, tuple]:
-    """Heights of air, window and gel between the planes ``from_mm`` (in the air) and ``z_mm``, and their indices."""
-    back, front = view.lens.back_mm, view.lens.z_mm
-    z = np.asarray(z_mm, float)
-    heights = np.minimum(z, back) - from_mm, np.clip(z, back, front) - back, np.maximum(z - front, 0)
-    return heights, (1.0, view.lens.refractive_index, view.gel_index)
 
 
 def _fisheye(camera: CameraSpec, angle: FloatArray) -> FloatArray:

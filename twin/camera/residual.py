@@ -36,12 +36,7 @@ def with_residual(spec: SensorSpec) -> SensorSpec:
 
 
 def refine(
-    gray: FloatArray,
-    residual: ResidualSpec,
-    luma: FloatArray,
-    columns: int,
-    rng: np.random.Generator | None = None,
-    origin_px: tuple[int, int] = (0, 0),
+    gray: FloatArray, residual: ResidualSpec, luma: FloatArray, columns: int, rng: np.random.Generator | None, origin_px: tuple[int, int]
 ) -> FloatArray:
     """Gray levels (H, W, 3) after the network, with the mean colour differences of the columns that share them.
 

@@ -28,11 +28,9 @@ from twin.signals import end_interrupted, end_on_sigterm
 # Modules of commands, in the order in which 'twin --help' lists them, each with the title above its commands.
 COMMANDS = {
     "start": "Begin",
-    "studio": "Begin",
     "frames": "Frames and pins",
     "calibration": "Your own sensor, and how true its twin is",
     "learning": "Data sets and models",
-    "records": "Data sets and models",
     "studies": "Studies",
     "live": "Cameras and arms",
 }
@@ -57,12 +55,8 @@ class _Commands(TyperGroup):
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         width = max(map(len, self.list_commands(ctx)))
         for title, names in self.commands_by_title(ctx).items():
-            commands = [self.get_command(ctx, name) for name in names]
-            rows = [
-                (f"{name:{width}}", command.get_short_help_str(formatter.width - width - 6))
-                for name, command in zip(names, commands, strict=True)
-                if command
-            ]
+            commands = [(name, self.get_command(ctx, name)) for name in names]
+            rows = [(f"{name:{width}}", each.get_short_help_str(formatter.width - width - 6)) for name, each in commands if each]
             with formatter.section(title):
                 formatter.write_dl(rows)
 
@@ -85,6 +79,13 @@ class FewCommands(TyperGroup):
         if args[0] not in self.list_commands(ctx) and not args[0].startswith("-") and not ctx.resilient_parsing:
             ctx.fail(f"No such command '{args[0]}'. There are {', '.join(self.list_commands(ctx))}.")
         return super().resolve_command(ctx, args)
+
+
+def group(name: str, help: str) -> App:
+    """A new group of commands of the program."""
+    made = App(cls=FewCommands, help=help, no_args_is_help=True, rich_markup_mode=None)
+    app.add_typer(made, name=name)
+    return made
 
 
 app = App(name="twin", cls=_Commands, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)

@@ -12,10 +12,9 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Exit, Option
 
-from twin.cli import FewCommands, app, options
-from twin.cli.command import App
+from twin.cli import app, group, options
 from twin.cli.options import Formerly, call, load_if_named, print_lines
 from twin.errors import OptionError
 from twin.progress import Progress
@@ -33,8 +32,7 @@ if TYPE_CHECKING:
     from twin.calibration.optics import OpticsCalibration
 
 Columns = Annotated[
-    list[str] | None,
-    typer.Option("--column", metavar="KEY=NAME", help="a table's column: Fz=normal, pose_3=-height, Fz=0.001*mN; repeat it"),
+    list[str] | None, Option("--column", metavar="KEY=NAME", help="a table's column: Fz=normal, pose_3=-height, Fz=0.001*mN; repeat it")
 ]
 
 
@@ -45,10 +43,10 @@ def columns_in(pairs: list[str] | None) -> dict[str, str]:
 
 @app.command("record")
 def record(
-    camera: Annotated[str, typer.Option(metavar="C", help="0, /dev/videoN, http://...")],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="new folder for the frames")],
-    count: Annotated[int, typer.Option(min=1, help="frames in contact")] = 40,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="port of the page with the picture; 0: a free one")] = 0,
+    camera: Annotated[str, Option(metavar="C", help="0, /dev/videoN, http://...")],
+    out: Annotated[Path, Option(metavar="DIR", help="new folder for the frames")],
+    count: Annotated[int, Option(min=1, help="frames in contact")] = 40,
+    port: Annotated[int, Option(min=0, max=65535, help="port of the page with the picture; 0: a free one")] = 0,
     *,
     progress: Progress,
 ) -> "RecordedFrames":
@@ -77,21 +75,17 @@ def record(
 
 @app.command("new")
 def new_sensor(
-    out: Annotated[Path, typer.Option(metavar="MY.toml", help="the specification to write")],
-    frames: Annotated[Path | None, typer.Argument(help="folder of frames, video or recording")] = None,
-    camera: Annotated[str, typer.Option(metavar="C", help="a live camera instead: 0, /dev/videoN, http://...")] = "",
-    label_table: Annotated[
-        Path | None, typer.Option(metavar="TABLE", help="table of labels: also fit the contact"), Formerly("labels")
-    ] = None,
-    experiment: Annotated[
-        str | None, typer.Option(metavar="E", help="experiment of the labelled contacts; by default from the table")
-    ] = None,
-    contacts: Annotated[int, typer.Option(min=4, metavar="N", help="labelled frames to which the contact is fitted")] = 20,
-    optics: Annotated[bool, typer.Option("--optics", help="also fit light and colours")] = False,
+    out: Annotated[Path, Option(metavar="MY.toml", help="the specification to write")],
+    frames: Annotated[Path | None, Argument(help="folder of frames, video or recording")] = None,
+    camera: Annotated[str, Option(metavar="C", help="a live camera instead: 0, /dev/videoN, http://...")] = "",
+    label_table: Annotated[Path | None, Option(metavar="TABLE", help="table of labels: also fit the contact"), Formerly("labels")] = None,
+    experiment: Annotated[str | None, Option(metavar="E", help="experiment of the labelled contacts; by default from the table")] = None,
+    contacts: Annotated[int, Option(min=4, metavar="N", help="labelled frames to which the contact is fitted")] = 20,
+    optics: Annotated[bool, Option("--optics", help="also fit light and colours")] = False,
     workers: options.Workers = options.CORES,
     elements: options.Elements = FINE,
-    layout: Annotated[str | None, typer.Option(metavar="L", help="the layout, if it is known")] = None,
-    radius_mm: Annotated[float | None, typer.Option(metavar="R", help="radius of the tip's dome (20 if not given)")] = None,
+    layout: Annotated[str | None, Option(metavar="L", help="the layout, if it is known")] = None,
+    radius_mm: Annotated[float | None, Option(metavar="R", help="radius of the tip's dome (20 if not given)")] = None,
     no_contact: options.NoContact = None,
     table: options.Table = None,
     form: options.FormOrAuto = None,
@@ -146,18 +140,15 @@ def new_sensor(
     return call(whole_sensor, locals(), layout=load_if_named(layout_from, layout))
 
 
-calibrate_app = App(
-    cls=FewCommands, help="Fit a sensor's specification to frames of a real one.", no_args_is_help=True, rich_markup_mode=None
-)
-app.add_typer(calibrate_app, name="calibrate")
+calibrate_app = group("calibrate", "Fit a sensor's specification to frames of a real one.")
 
 
 @calibrate_app.command("optics")
 def calibrate_optics(
     sensor: options.Sensor,
-    frames: Annotated[Path, typer.Option(metavar="DIR", help="folder of raw frames, in contact or not")],
-    out: Annotated[Path, typer.Option(metavar="SPEC.toml", help="the specification to write")],
-    no_contact: Annotated[Path | None, typer.Option(metavar="FRAME", help="a raw frame without contact: fits the camera")] = None,
+    frames: Annotated[Path, Option(metavar="DIR", help="folder of raw frames, in contact or not")],
+    out: Annotated[Path, Option(metavar="SPEC.toml", help="the specification to write")],
+    no_contact: Annotated[Path | None, Option(metavar="FRAME", help="a raw frame without contact: fits the camera")] = None,
     max_frames: options.MaxFrames = 6,
     pipeline: options.Tuning = None,
     *,
@@ -195,13 +186,13 @@ def calibrate_optics(
 @calibrate_app.command("contact", goes_on=True)
 def calibrate_contact(
     sensor: options.Sensor,
-    frames: Annotated[Path, typer.Option(metavar="DIR", help="labelled recording with init_0.png, or TABLE.csv of forces")],
-    out: Annotated[Path, typer.Option(metavar="SPEC.toml", help="the specification to write")],
-    num_labelled: Annotated[int, typer.Option(min=4, metavar="N", help="frames to fit to, chosen at random"), Formerly("labels")] = 20,
-    seed: Annotated[int, typer.Option(min=0, help="seed of the choice of frames")] = 0,
+    frames: Annotated[Path, Option(metavar="DIR", help="labelled recording with init_0.png, or TABLE.csv of forces")],
+    out: Annotated[Path, Option(metavar="SPEC.toml", help="the specification to write")],
+    num_labelled: Annotated[int, Option(min=4, metavar="N", help="frames to fit to, chosen at random"), Formerly("labels")] = 20,
+    seed: Annotated[int, Option(min=0, help="seed of the choice of frames")] = 0,
     experiment: options.Experiment = "surface-2d",
     obj: options.TouchedObject = None,
-    hold: Annotated[list[str] | None, typer.Option(metavar="KEY", help="do not fit this parameter; may be repeated")] = None,
+    hold: Annotated[list[str] | None, Option(metavar="KEY", help="do not fit this parameter; may be repeated")] = None,
     workers: options.Workers = options.CORES,
     elements: options.Elements = FINE,
     form: options.FormOrAuto = None,
@@ -252,15 +243,13 @@ def calibrate_contact(
 @app.command("validate")
 def validate(
     sensor: options.Sensor,
-    frames: Annotated[Path, typer.Option(metavar="DIR", help="labelled recording, or TABLE.csv of forces")],
+    frames: Annotated[Path, Option(metavar="DIR", help="labelled recording, or TABLE.csv of forces")],
     out: options.Out,
     experiment: options.Experiment = "surface-2d",
-    obj: Annotated[str | None, typer.Option("--object", metavar="O", help="the touched object; the experiment's own if not given")] = None,
-    max_frames: Annotated[int | None, typer.Option(min=1, metavar="N", help="N frames, chosen at random"), Formerly("limit")] = None,
-    friction_frames: Annotated[
-        int, typer.Option(min=0, metavar="N", help="frames for which the best friction is searched, 9 contacts each")
-    ] = 5,
-    seed: Annotated[int, typer.Option(min=0, help="seed of the choice of frames")] = 0,
+    obj: Annotated[str | None, Option("--object", metavar="O", help="the touched object; the experiment's own if not given")] = None,
+    max_frames: Annotated[int | None, Option(min=1, metavar="N", help="N frames, chosen at random"), Formerly("limit")] = None,
+    friction_frames: Annotated[int, Option(min=0, metavar="N", help="frames for which the best friction is searched, 9 contacts each")] = 5,
+    seed: Annotated[int, Option(min=0, help="seed of the choice of frames")] = 0,
     elements: options.Elements = FINE,
     form: options.FormOrAuto = None,
     table: options.Table = None,
@@ -297,18 +286,18 @@ def validate(
 
 @app.command("realism")
 def realism(
-    path: Annotated[Path, typer.Argument(help="folder of real raw frames")],
+    path: Annotated[Path, Argument(help="folder of real raw frames")],
     sensor: options.Sensor,
     out: options.Out,
-    pose_aligned: Annotated[bool, typer.Option("--pose-aligned", help="also render from the labels alone")] = False,
-    max_frames: Annotated[int | None, typer.Option(min=1, metavar="N", help="at most N frames, evenly spread"), Formerly("limit")] = None,
-    fitted: Annotated[int, typer.Option(min=0, metavar="N", help="leave out the frames that 'calibrate optics --max-frames N' fits")] = 0,
-    without: Annotated[list[str] | None, typer.Option(metavar="DETAIL", help="relief, grain or background; may be repeated")] = None,
+    pose_aligned: Annotated[bool, Option("--pose-aligned", help="also render from the labels alone")] = False,
+    max_frames: Annotated[int | None, Option(min=1, metavar="N", help="at most N frames, evenly spread"), Formerly("limit")] = None,
+    fitted: Annotated[int, Option(min=0, metavar="N", help="leave out the frames that 'calibrate optics --max-frames N' fits")] = 0,
+    without: Annotated[list[str] | None, Option(metavar="DETAIL", help="relief, grain or background; may be repeated")] = None,
     residual: options.Residual = False,
-    quality: Annotated[Quality, typer.Option(help=options.QUALITY)] = "standard",
-    two_sample: Annotated[bool, typer.Option("--two-sample/--no-two-sample", help="train the two-sample test (minutes)")] = True,
+    quality: Annotated[Quality, Option(help=options.QUALITY)] = "standard",
+    two_sample: Annotated[bool, Option("--two-sample/--no-two-sample", help="train the two-sample test (minutes)")] = True,
     thorough: Annotated[
-        bool, typer.Option("--thorough", help="test with a stronger network, too, and with halves of the real frames (ten minutes)")
+        bool, Option("--thorough", help="test with a stronger network, too, and with halves of the real frames (ten minutes)")
     ] = False,
     table: options.Table = None,
     pipeline: options.Tuning = None,
@@ -366,7 +355,7 @@ def _list_conditions(asked: bool) -> None:
 
     if asked:
         print_lines(condition_lines())
-        raise typer.Exit
+        raise Exit
 
 
 @app.command("robustness", goes_on=True)
@@ -375,19 +364,17 @@ def robustness(
     out: options.Out,
     pipeline: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="P", help="twin, legacy, adaptive, fixed, simple, log, dog, doh, a file of 'twin tune', or your own as FILE.py:FUNCTION"
         ),
     ] = None,
-    model: Annotated[list[Path] | None, typer.Option(metavar="RUN", help="folder of a trained model")] = None,
-    conditions: Annotated[Path | None, typer.Option(metavar="FILE", help="TOML file: which conditions, ranges, steps, pairs")] = None,
-    frames: Annotated[Path | None, typer.Option(metavar="DIR", help="real frames instead of rendered ones")] = None,
-    max_frames: Annotated[
-        int, typer.Option(min=2, metavar="N", help="at most N of the real frames, evenly spread"), Formerly("limit")
-    ] = 12,
-    rendered: Annotated[bool, typer.Option("--rendered/--no-rendered", help="raw --frames beside rendered ones")] = True,
-    jobs: Annotated[int, typer.Option(min=1, metavar="N", help="processes")] = options.CORES,
-    show: Annotated[bool, typer.Option("--list", is_eager=True, callback=_list_conditions, help="list the conditions and stop")] = False,
+    model: Annotated[list[Path] | None, Option(metavar="RUN", help="folder of a trained model")] = None,
+    conditions: Annotated[Path | None, Option(metavar="FILE", help="TOML file: which conditions, ranges, steps, pairs")] = None,
+    frames: Annotated[Path | None, Option(metavar="DIR", help="real frames instead of rendered ones")] = None,
+    max_frames: Annotated[int, Option(min=2, metavar="N", help="at most N of the real frames, evenly spread"), Formerly("limit")] = 12,
+    rendered: Annotated[bool, Option("--rendered/--no-rendered", help="raw --frames beside rendered ones")] = True,
+    jobs: Annotated[int, Option(min=1, metavar="N", help="processes")] = options.CORES,
+    show: Annotated[bool, Option("--list", is_eager=True, callback=_list_conditions, help="list the conditions and stop")] = False,
     *,
     progress: Progress,
 ) -> "DegradationResult":
@@ -448,7 +435,7 @@ def robustness(
 
 @app.command("audit")
 def audit(
-    data: Annotated[Path, typer.Argument(help="labelled recording")],
+    data: Annotated[Path, Argument(help="labelled recording")],
     sensor: options.Sensor,
     out: options.Out,
     form: options.FormOrAuto = None,

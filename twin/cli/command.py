@@ -101,20 +101,14 @@ def as_function(work: Callable[..., Made], help: str) -> Callable[..., Made]:
     added where the command has them.
     """
     options = inspect.signature(work).parameters
-    marks = {
-        name: mark
-        for name, each in options.items()
-        for mark in getattr(each.annotation, "__metadata__", ())
-        if isinstance(mark, ParameterInfo)
-    }
-    kinds = {
-        name: Parameter.POSITIONAL_OR_KEYWORD if isinstance(mark, ArgumentInfo) else Parameter.KEYWORD_ONLY
+    marks = {name: mark for name, each in options.items() if (mark := _mark(each)) is not None}
+    kinds = {True: Parameter.POSITIONAL_OR_KEYWORD, False: Parameter.KEYWORD_ONLY}
+    public = [
+        options[name].replace(kind=kinds[isinstance(mark, ArgumentInfo)], annotation=_plain(options[name]))
         for name, mark in marks.items()
         if not mark.is_eager
-    }
-    public = [
-        options[name].replace(kind=kinds[name], annotation=_plain(options[name])) for name in sorted(kinds, key=lambda name: kinds[name])
     ]
+    public.sort(key=lambda each: each.kind)
     added = {"force": (writes(options), False, bool), "progress": ("progress" in options, None, Progress | bool | None)}
     public += [Parameter(name, Parameter.KEYWORD_ONLY, default=d, annotation=kind) for name, (has, d, kind) in added.items() if has]
     signature = inspect.Signature(public, return_annotation=inspect.signature(work).return_annotation)
@@ -154,7 +148,8 @@ def with_present_names(given: dict[str, Any], former: Mapping[str, str]) -> dict
 
 def _hidden(old: str, option: Parameter) -> Parameter:
     """The option under its former name, which no help shows."""
-    mark = copy(next(each for each in option.annotation.__metadata__ if isinstance(each, ParameterInfo)))
+    mark = copy(_mark(option))
+    assert mark is not None, "only options have former names"
     prefixes = ("", "no-") if _plain(option) is bool else ("",)
     mark.param_decls = ("/".join(f"--{prefix}{old.replace('_', '-')}" for prefix in prefixes),)
     mark.default, mark.hidden = ..., True  # in ``Annotated`` the default holds the option's first name
@@ -176,6 +171,11 @@ def _with_former_values(option: Parameter) -> Parameter:
     (mark,) = (copy(each) for each in option.annotation.__metadata__)
     mark.parser, mark.metavar, mark.autocompletion = parse, f"<{'|'.join(values)}>", lambda: values
     return option.replace(annotation=Annotated[_plain(option), mark])
+
+
+def _mark(option: Parameter) -> ParameterInfo | None:
+    """The mark of an option of the command line; None for other parameters."""
+    return next((mark for mark in getattr(option.annotation, "__metadata__", ()) if isinstance(mark, ParameterInfo)), None)
 
 
 def _plain(option: Parameter) -> Any:

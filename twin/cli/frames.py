@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
+from typer import Argument, Option
 
 from twin.cli import app, options
 from twin.cli.options import call, load_if_named, sensor_with
@@ -22,14 +22,16 @@ if TYPE_CHECKING:
     from twin.pins.detectors.tune_files import TunedOnFrames
     from twin.pins.graph_files import Graphs
 
+Method = Literal["twin", "legacy", "adaptive", "fixed", "simple", "log", "dog", "doh"]
+
 
 @app.command("preprocess")
 def preprocess(
-    path: Annotated[Path, typer.Argument(help="image, folder of frames, video or recording")],
+    path: Annotated[Path, Argument(help="image, folder of frames, video or recording")],
     sensor: options.Sensor,
     out: options.Out,
     form: options.FormOrAuto = None,
-    overlay: Annotated[bool, typer.Option("--overlay", help="also write a picture of every frame with its pins and graph")] = False,
+    overlay: Annotated[bool, Option("--overlay", help="also write a picture of every frame with its pins and graph")] = False,
     table: options.Table = None,
     no_contact: options.NoContact = None,
     pipeline: options.Tuning = None,
@@ -72,12 +74,12 @@ def preprocess(
 
 @app.command("graph")
 def graph(
-    path: Annotated[Path, typer.Argument(help="frame, folder of frames, or pins.npz")],
+    path: Annotated[Path, Argument(help="frame, folder of frames, or pins.npz")],
     sensor: options.Sensor,
     out: options.Out,
-    kind: Annotated[Literal["knn", "delaunay", "voronoi"], typer.Option(help="kind of graph")] = "voronoi",
+    kind: Annotated[Literal["knn", "delaunay", "voronoi"], Option(help="kind of graph")] = "voronoi",
     form: options.FormOrAuto = None,
-    legacy: Annotated[bool, typer.Option("--legacy", help="method and boundary of the published code, for comparison")] = False,
+    legacy: Annotated[bool, Option("--legacy", help="method and boundary of the published code, for comparison")] = False,
     table: options.Table = None,
     no_contact: options.NoContact = None,
     pipeline: options.Tuning = None,
@@ -116,11 +118,9 @@ def graph(
 @app.command("tune")
 def tune(
     sensor: options.Sensor,
-    frames: Annotated[Path, typer.Option(metavar="DIR", help="folder of frames, video or recording")],
-    out: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="the file to write")] = None,
-    method: Annotated[
-        Literal["twin", "legacy", "adaptive", "fixed", "simple", "log", "dog", "doh"], typer.Option(help="method to tune")
-    ] = "twin",
+    frames: Annotated[Path, Option(metavar="DIR", help="folder of frames, video or recording")],
+    out: Annotated[Path | None, Option(metavar="FILE.toml", help="the file to write")] = None,
+    method: Annotated[Method, Option(help="method to tune")] = "twin",
     form: options.FormOrAuto = None,
     max_frames: options.MaxFrames = 12,
     table: options.Table = None,
@@ -156,25 +156,22 @@ FAILED = 3
 @app.command("check", exit_code=lambda found: FAILED if found.failed else 0)
 def check(
     source: Annotated[
-        str, typer.Argument(metavar="FRAME", help="image, folder of frames, video, recording, or a camera: 0, /dev/video2, http://...")
+        str, Argument(metavar="FRAME", help="image, folder of frames, video, recording, or a camera: 0, /dev/video2, http://...")
     ],
     sensor: options.Sensor,
     form: options.FormOrAuto = None,
-    pipeline: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="file of 'twin tune'")] = None,
+    pipeline: Annotated[Path | None, Option(metavar="FILE.toml", help="file of 'twin tune'")] = None,
     max_frames: options.MaxFrames = 20,
-    no_contact: Annotated[Path | None, typer.Option(metavar="FRAME", help="frame without contact, for --push")] = None,
+    no_contact: Annotated[Path | None, Option(metavar="FRAME", help="frame without contact, for --push")] = None,
     push: Annotated[
-        list[str] | None,
-        typer.Option(metavar="SIDE:FRAME", help="contact whose object was moved to the sensor's x, y, -x or -y; repeat it"),
+        list[str] | None, Option(metavar="SIDE:FRAME", help="contact whose object was moved to the sensor's x, y, -x or -y; repeat it")
     ] = None,
     twist: Annotated[
-        Path | None, typer.Option(metavar="FRAME", help="contact whose object was turned from x to y, instead of a second push")
+        Path | None, Option(metavar="FRAME", help="contact whose object was turned from x to y, instead of a second push")
     ] = None,
-    out: Annotated[Path | None, typer.Option(metavar="FILE.toml", help="copy of the specification with the view of --push")] = None,
-    page: Annotated[Path | None, typer.Option(metavar="DIR", help="folder for a page with the findings and pictures")] = None,
-    model: Annotated[
-        Path | None, typer.Option(metavar="RUN", help="run that must know the contacts; by default the sensor's weights")
-    ] = None,
+    out: Annotated[Path | None, Option(metavar="FILE.toml", help="copy of the specification with the view of --push")] = None,
+    page: Annotated[Path | None, Option(metavar="DIR", help="folder for a page with the findings and pictures")] = None,
+    model: Annotated[Path | None, Option(metavar="RUN", help="run that must know the contacts; by default the sensor's weights")] = None,
     *,
     progress: Progress,
 ) -> "Examination":

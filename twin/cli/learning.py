@@ -8,15 +8,16 @@
 - ``twin surrogate``: a fast surrogate model of a sensor's finite elements.
 - ``twin demonstrate``: episodes of a task by a scripted expert.
 - ``twin learn``: a policy of a task.
+- ``twin convert``: records in the formats of other tools.
 """
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
+from typer import Argument, Option
 
 from twin.cli import app, options
-from twin.cli.options import Formerly, call, each_once, finite, names_in, print_lines
+from twin.cli.options import Formerly, call, each_once, finite, load_if_named, names_in, print_lines
 from twin.errors import OptionError
 from twin.progress import Progress
 from twin.types import FINE, Quality
@@ -28,29 +29,30 @@ if TYPE_CHECKING:
     from training.studies.evaluation import Evaluation, Predictions
     from training.studies.train import TrainedRun
     from training.surrogate.fit import Distilled
+    from twin.records import Converted
 
 
-TaskName = Annotated[str, typer.Option("--task", metavar="T", help="EdgeFollow, SurfaceFollow, ContourFollow, GentlePress, ...")]
-RandomiseEpisodes = Annotated[str | None, typer.Option("--randomise", metavar="R", help="domain randomisation of episodes, e.g. moves")]
-OwnSurrogate = Annotated[Path | None, typer.Option("--surrogate", metavar="FILE", help="surrogate model of your own sensor")]
-TaskObjects = Annotated[str | None, typer.Option("--objects", callback=each_once, help="objects instead of the task's, with commas")]
+TaskName = Annotated[str, Option("--task", metavar="T", help="EdgeFollow, SurfaceFollow, ContourFollow, GentlePress, ...")]
+RandomiseEpisodes = Annotated[str | None, Option("--randomise", metavar="R", help="domain randomisation of episodes, e.g. moves")]
+OwnSurrogate = Annotated[Path | None, Option("--surrogate", metavar="FILE", help="surrogate model of your own sensor")]
+TaskObjects = Annotated[str | None, Option("--objects", callback=each_once, help="objects instead of the task's, with commas")]
 
 
 @app.command("dataset", goes_on=True)
 def make_dataset(
     experiment: options.Experiment,
     sensor: options.Sensor,
-    count: Annotated[int, typer.Option(min=1, metavar="N", help="contacts")],
+    count: Annotated[int, Option(min=1, metavar="N", help="contacts")],
     out: options.Out,
-    wide: Annotated[bool, typer.Option("--wide", help="slightly larger ranges, for a training set")] = False,
+    wide: Annotated[bool, Option("--wide", help="slightly larger ranges, for a training set")] = False,
     obj: options.TouchedObject = None,
-    images: Annotated[Literal["raw", "gray", "processed", "none"], typer.Option(help="kind of pictures")] = "raw",
-    states: Annotated[Literal["all", "end"], typer.Option(help="states of a contact that become frames")] = "end",
-    randomise: Annotated[str | None, typer.Option(metavar="R", help="domain randomisation: a name or a file; none by default")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="seed of all samples; the experiment's own if not given")] = None,
+    images: Annotated[Literal["raw", "gray", "processed", "none"], Option(help="kind of pictures")] = "raw",
+    states: Annotated[Literal["all", "end"], Option(help="states of a contact that become frames")] = "end",
+    randomise: Annotated[str | None, Option(metavar="R", help="domain randomisation: a name or a file; none by default")] = None,
+    seed: Annotated[int | None, Option(min=0, help="seed of all samples; the experiment's own if not given")] = None,
     workers: options.Workers = options.CORES,
-    scheduler: Annotated[str, typer.Option(metavar="ADDRESS", help="address of a running Dask scheduler")] = "",
-    quality: Annotated[Quality | None, typer.Option(help=options.QUALITY, show_default="rasterised")] = None,
+    scheduler: Annotated[str, Option(metavar="ADDRESS", help="address of a running Dask scheduler")] = "",
+    quality: Annotated[Quality | None, Option(help=options.QUALITY, show_default="rasterised")] = None,
     residual: options.Residual = False,
     elements: options.Elements = FINE,
     also: options.Also = None,
@@ -119,21 +121,21 @@ def require_one_recording(folders: list[Path], table: Path | None, no_contact: P
 
 @app.command("train", goes_on=True)
 def train(
-    model: Annotated[str, typer.Option(help="vgnn, touch, steered, tac-vgnn, tac-vgnn-release, gnn, cnn-v1 or cnn-v2")],
+    model: Annotated[str, Option(help="vgnn, touch, steered, tac-vgnn, tac-vgnn-release, gnn, cnn-v1 or cnn-v2")],
     sensor: options.Sensor,
-    data: Annotated[list[Path], typer.Option(metavar="DIR", help="labelled recording; give it once for each of several")],
-    out: Annotated[Path, typer.Option(metavar="RUN", help="folder of the run; made if missing")],
+    data: Annotated[list[Path], Option(metavar="DIR", help="labelled recording; give it once for each of several")],
+    out: Annotated[Path, Option(metavar="RUN", help="folder of the run; made if missing")],
     target: options.Target = "surface-2d",
-    label_kind: Annotated[str, typer.Option(help="corrected or raw"), Formerly("labels")] = "corrected",
-    seed: Annotated[int, typer.Option(min=0, max=options.MOST_SEED, help="seed of weights and order")] = 0,
-    split: Annotated[int, typer.Option(min=-1, max=options.MOST_SEED, help="seed of the held-out fifth; -1: nothing is held out")] = 0,
-    epochs: Annotated[int | None, typer.Option(help="epochs of training, instead of the model's own number")] = None,
-    batch: Annotated[int | None, typer.Option(help="batch size, instead of the model's own")] = None,
-    members: Annotated[int | None, typer.Option(help="networks in the ensemble")] = None,
+    label_kind: Annotated[str, Option(help="corrected or raw"), Formerly("labels")] = "corrected",
+    seed: Annotated[int, Option(min=0, max=options.MOST_SEED, help="seed of weights and order")] = 0,
+    split: Annotated[int, Option(min=-1, max=options.MOST_SEED, help="seed of the held-out fifth; -1: nothing is held out")] = 0,
+    epochs: Annotated[int | None, Option(help="epochs of training, instead of the model's own number")] = None,
+    batch: Annotated[int | None, Option(help="batch size, instead of the model's own")] = None,
+    members: Annotated[int | None, Option(help="networks in the ensemble")] = None,
     kernel: Annotated[
-        bool | None, typer.Option("--kernel/--no-kernel", help="Gaussian process beside the networks; slow for thousands of rows")
+        bool | None, Option("--kernel/--no-kernel", help="Gaussian process beside the networks; slow for thousands of rows")
     ] = None,
-    max_minutes: Annotated[float | None, typer.Option(min=0, callback=finite, help="stop after the epoch that passes this time")] = None,
+    max_minutes: Annotated[float | None, Option(min=0, callback=finite, help="stop after the epoch that passes this time")] = None,
     threads: options.Threads = None,
     device: options.Device = "auto",
     form: options.FormOrAuto = None,
@@ -196,14 +198,12 @@ def train(
 
 @app.command("evaluate")
 def evaluate(
-    run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights are shipped")],
-    data: Annotated[list[Path], typer.Option(metavar="DIR", help="labelled recording; give all that the run was trained on")],
+    run: Annotated[Path, Argument(help="folder of a training run, or a sensor whose weights are shipped")],
+    data: Annotated[list[Path], Option(metavar="DIR", help="labelled recording; give all that the run was trained on")],
     out: options.Out,
-    rows: Annotated[str, typer.Option(help="validation or all")] = "validation",
-    label_kind: Annotated[
-        str, typer.Option(help="truth in predictions.csv and errors.png: corrected or raw"), Formerly("labels")
-    ] = "corrected",
-    robustness: Annotated[bool, typer.Option("--robustness", help="also evaluate changed images (five times the frames)")] = False,
+    rows: Annotated[str, Option(help="validation or all")] = "validation",
+    label_kind: Annotated[str, Option(help="truth in predictions.csv and errors.png: corrected or raw"), Formerly("labels")] = "corrected",
+    robustness: Annotated[bool, Option("--robustness", help="also evaluate changed images (five times the frames)")] = False,
     table: options.Table = None,
     no_contact: options.NoContact = None,
     *,
@@ -245,10 +245,10 @@ def evaluate(
 
 @app.command("predict")
 def predict(
-    run: Annotated[Path, typer.Argument(help="folder of a training run, or a sensor whose weights are shipped")],
-    frame: Annotated[Path, typer.Argument(help="frame, folder of frames, video or recording")],
-    maps: Annotated[Path | None, typer.Option(metavar="DIR", help="folder for the contact maps of each frame")] = None,
-    sequence: Annotated[bool, typer.Option("--sequence", help="the frames are a sequence in time: estimate slip, too")] = False,
+    run: Annotated[Path, Argument(help="folder of a training run, or a sensor whose weights are shipped")],
+    frame: Annotated[Path, Argument(help="frame, folder of frames, video or recording")],
+    maps: Annotated[Path | None, Option(metavar="DIR", help="folder for the contact maps of each frame")] = None,
+    sequence: Annotated[bool, Option("--sequence", help="the frames are a sequence in time: estimate slip, too")] = False,
     table: options.Table = None,
     no_contact: options.NoContact = None,
 ) -> "Predictions":
@@ -279,7 +279,7 @@ def predict(
 
 
 @app.command("pack")
-def pack_run(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, touch or steered")], out: options.Out) -> None:
+def pack_run(run: Annotated[Path, Argument(help="folder of a run of vgnn, touch or steered")], out: options.Out) -> None:
     """Write a small copy of a finished training run.
 
     Its numbers have half the precision, and its size is less than a tenth. Every command that takes a RUN takes it. This packs the run of
@@ -302,9 +302,9 @@ def pack_run(run: Annotated[Path, typer.Argument(help="folder of a run of vgnn, 
 @app.command("surrogate")
 def make_surrogate(
     sensor: options.Sensor,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="file to write, *.safetensors")],
-    paths: Annotated[int, typer.Option(metavar="N", min=10, help="solved paths to train on, about 6 s each on one core")] = 120,
-    seed: Annotated[int, typer.Option(min=0, help="seed of the sampled paths")] = 0,
+    out: Annotated[Path, Option(metavar="FILE", help="file to write, *.safetensors")],
+    paths: Annotated[int, Option(metavar="N", min=10, help="solved paths to train on, about 6 s each on one core")] = 120,
+    seed: Annotated[int, Option(min=0, help="seed of the sampled paths")] = 0,
     workers: options.Workers = options.CORES,
     *,
     progress: Progress,
@@ -332,12 +332,12 @@ def demonstrate(
     task: TaskName,
     sensor: options.Sensor,
     out: options.Out,
-    episodes: Annotated[int, typer.Option(min=1, metavar="N", help="solved episodes")] = 50,
+    episodes: Annotated[int, Option(min=1, metavar="N", help="solved episodes")] = 50,
     randomise: RandomiseEpisodes = None,
     surrogate: OwnSurrogate = None,
     objects: TaskObjects = None,
-    video: Annotated[bool, typer.Option("--video", help="pictures as video, which loses detail")] = False,
-    seed: Annotated[int, typer.Option(min=0, max=options.MOST_SEED, help="seed of the episodes")] = 0,
+    video: Annotated[bool, Option("--video", help="pictures as video, which loses detail")] = False,
+    seed: Annotated[int, Option(min=0, max=options.MOST_SEED, help="seed of the episodes")] = 0,
     *,
     progress: Progress,
 ) -> "Demonstrations":
@@ -372,24 +372,22 @@ def learn(
     task: TaskName,
     sensor: options.Sensor,
     out: options.Out,
-    observation: Annotated[str, typer.Option(help="pins, image, graph, pose or oracle")] = "pins",
+    observation: Annotated[str, Option(help="pins, image, graph, pose or oracle")] = "pins",
     randomise: RandomiseEpisodes = None,
     surrogate: OwnSurrogate = None,
     objects: TaskObjects = None,
     friction_history: Annotated[
         bool,
-        typer.Option("--friction-history/--no-friction-history", help="history-dependent friction; switch it off to measure its effect"),
+        Option("--friction-history/--no-friction-history", help="history-dependent friction; switch it off to measure its effect"),
         Formerly("memory"),
     ] = True,
     state_estimator: Annotated[
-        bool,
-        typer.Option("--state-estimator/--no-state-estimator", help="first train a state estimator of place and force"),
-        Formerly("sight"),
+        bool, Option("--state-estimator/--no-state-estimator", help="first train a state estimator of place and force"), Formerly("sight")
     ] = True,
-    minutes: Annotated[float, typer.Option(min=0, callback=finite, help="maximum time")] = 30.0,
-    environments: Annotated[int, typer.Option(min=2, help="number of environments that are stepped together")] = 32,
-    fem: Annotated[int, typer.Option(min=0, metavar="N", help="episodes with finite elements for the evaluation")] = 0,
-    seed: Annotated[int, typer.Option(min=0, max=options.MOST_SEED, help="seed of weights and episodes")] = 0,
+    minutes: Annotated[float, Option(min=0, callback=finite, help="maximum time")] = 30.0,
+    environments: Annotated[int, Option(min=2, help="number of environments that are stepped together")] = 32,
+    fem: Annotated[int, Option(min=0, metavar="N", help="episodes with finite elements for the evaluation")] = 0,
+    seed: Annotated[int, Option(min=0, max=options.MOST_SEED, help="seed of weights and episodes")] = 0,
     *,
     progress: Progress,
 ) -> "Learnt":
@@ -414,3 +412,48 @@ def learn(
     chosen = call(Options, locals(), objects=names_in(objects) if objects else None)
     plan = call(LearnPlan, locals(), options=chosen, fem_episodes=fem, sight=state_estimator)
     return learn_policy(plan, out, progress=progress)
+
+
+# Formats that can be written, as in ``twin.records.FORMATS``, whose import would load the pin detection.
+Format = Literal["recording", "lerobot", "huggingface", "mcap"]
+
+
+@app.command("convert")
+def convert_command(
+    sources: Annotated[list[Path], Argument(metavar="SOURCE...", help="recordings, sessions, or converted records")],
+    to: Annotated[Format, Option(metavar="FORMAT", help="recording, lerobot, huggingface or mcap")],
+    out: options.Out,
+    sensor: Annotated[str | None, Option(metavar="S", help="sensor for the pin detection; by default that of a source")] = None,
+    task: Annotated[str, Option(metavar="TEXT", help="task of the episodes; by default that of each source")] = "",
+    video: Annotated[bool, Option("--video", help="with lerobot: pictures as video, which loses detail")] = False,
+    *,
+    progress: Progress,
+) -> "Converted":
+    """Convert records to other tools' formats, and back.
+
+    A SOURCE is a recording, a simulated data set, a collection, the session of 'twin live --record' or 'twin servo --record', or the output
+    of this command. One contact path, or one round of a servo, is one episode.
+
+    \b
+    --to recording    pictures with targets.csv, which every command here reads
+         lerobot      LeRobotDataset v3; pictures lossless (PNG), or with --video
+         huggingface  pictures with metadata, for 'imagefolder' and the viewer
+         mcap         a file with ROS 2 messages for each episode
+
+    Every format contains the picture, the time, and, if the source has them, pins, pose, move, wrench, estimate and action. Pins are
+    found in the pictures if the source has none and its sensor is known. docs/records.md has names, units, frames and axes.
+
+    After an interruption the same command resumes. It also adds new sources: several rounds become one data set. Existing episodes are
+    not written again.
+
+    \b
+    Examples:
+      twin convert out/servo/session --to lerobot --out out/dataset
+      twin convert sim/surface --to mcap --out out/bags
+      twin convert recordings/mine --sensor mine.toml --to huggingface \\
+          --out out/pictures
+    """
+    from scenes import load_sensor
+    from twin.records import convert
+
+    return convert(sources, out, to, sensor=load_if_named(load_sensor, sensor), task=task, video=video, progress=progress)

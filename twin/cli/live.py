@@ -11,10 +11,9 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Exit, Option
 
-from twin.cli import FewCommands, app, options
-from twin.cli.command import App
+from twin.cli import app, group, options
 from twin.cli.options import Formerly, call, print_lines
 from twin.progress import Progress
 from twin.signals import signals_as_ctrl_c
@@ -29,33 +28,33 @@ if TYPE_CHECKING:
 
 # Sensor whose trained weights are shipped with the package.
 SHIPPED_MODEL = Path("mg400-331")
-Model = Annotated[Path, typer.Option("--model", metavar="RUN", help="folder of a run, or a sensor whose weights are shipped")]
+Model = Annotated[Path, Option("--model", metavar="RUN", help="folder of a run, or a sensor whose weights are shipped")]
 Camera = Annotated[
     str,
-    typer.Option(
+    Option(
         "--camera", metavar="C", help="twin, a number, /dev/videoN, http://..., rtsp://..., ros2:/TOPIC, a folder or video, mujoco:SCENE"
     ),
 ]
-Steps = Annotated[int | None, typer.Option("--steps", min=1, help="number of steps, instead of once around the object")]
-Record = Annotated[bool, typer.Option("--record", help="keep every frame and step in OUT/session")]
-NoiseSeed = Annotated[int, typer.Option("--seed", min=0, help="seed of the twin's noise")]
-KnownPlace = Annotated[bool, typer.Option("--known-place", help="the object stands exactly at --servo: measure errors against it")]
+Steps = Annotated[int | None, Option("--steps", min=1, help="number of steps, instead of once around the object")]
+Record = Annotated[bool, Option("--record", help="keep every frame and step in OUT/session")]
+NoiseSeed = Annotated[int, Option("--seed", min=0, help="seed of the twin's noise")]
+KnownPlace = Annotated[bool, Option("--known-place", help="the object stands exactly at --servo: measure errors against it")]
 ArmOption = Annotated[
     str,
-    typer.Option(
+    Option(
         "--arm",
         metavar="A",
         help="simulated, simulated:4, mg400[-lenient]:ADDRESS[:DASHBOARD_PORT], magician:PORT, ros2:twist, ros2:pose, ur:ADDRESS",
     ),
 ]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="check and print the plan, without motion")]
-Limits = Annotated[str | None, typer.Option("--safety", help="limits: mg400, magician, ros2, ur, or a TOML file"), Formerly("limits")]
+DryRun = Annotated[bool, Option("--dry-run", help="check and print the plan, without motion")]
+Limits = Annotated[str | None, Option("--safety", help="limits: mg400, magician, ros2, ur, or a TOML file"), Formerly("limits")]
 Ros2 = Annotated[
-    str | None, typer.Option("--ros2", metavar="NAME", help="publish frames, pins and estimates as ROS 2 topics /NAME/..., such as tactip")
+    str | None, Option("--ros2", metavar="NAME", help="publish frames, pins and estimates as ROS 2 topics /NAME/..., such as tactip")
 ]
 AtRest = Annotated[
     str,
-    typer.Option(
+    Option(
         "--at-rest",
         metavar="FRAME|first|none",
         help="frame without contact, the zero of displacements: a file, the first frame (an error if it shows a contact), "
@@ -68,17 +67,17 @@ AtRest = Annotated[
 def live(
     model: Model = SHIPPED_MODEL,
     camera: Camera = "",
-    record: Annotated[Path | None, typer.Option(metavar="DIR", help="new folder for the session")] = None,
-    replay: Annotated[Path | None, typer.Option(metavar="DIR", help="recorded session, instead of a camera")] = None,
-    headless: Annotated[bool, typer.Option("--headless", help="no page: only print the figures at the end")] = False,
-    rerun: Annotated[str | None, typer.Option(metavar="T", help="viewer, a new file *.rrd, or a viewer's address rerun+http://...")] = None,
-    seconds: Annotated[float | None, typer.Option(min=0, help="stop after this time")] = None,
-    count: Annotated[int | None, typer.Option(min=1, help="stop after this number of frames")] = None,
-    rate: Annotated[float | None, typer.Option(min=0.1, help="most frames a second that are used, each time the newest")] = None,
+    record: Annotated[Path | None, Option(metavar="DIR", help="new folder for the session")] = None,
+    replay: Annotated[Path | None, Option(metavar="DIR", help="recorded session, instead of a camera")] = None,
+    headless: Annotated[bool, Option("--headless", help="no page: only print the figures at the end")] = False,
+    rerun: Annotated[str | None, Option(metavar="T", help="viewer, a new file *.rrd, or a viewer's address rerun+http://...")] = None,
+    seconds: Annotated[float | None, Option(min=0, help="stop after this time")] = None,
+    count: Annotated[int | None, Option(min=1, help="stop after this number of frames")] = None,
+    rate: Annotated[float | None, Option(min=0.1, help="most frames a second that are used, each time the newest")] = None,
     at_rest: AtRest = NONE,
     also: options.Also = None,
     ros2: Ros2 = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="port of the page; if it is taken, the next free one")] = 8080,
+    port: Annotated[int, Option(min=0, max=65535, help="port of the page; if it is taken, the next free one")] = 8080,
 ) -> "WatchResult":
     """Show a model's estimates on a camera's frames.
 
@@ -121,13 +120,13 @@ def collect(
     sensor: options.Sensor,
     out: options.Out,
     experiment: options.Experiment = "surface-2d",
-    count: Annotated[int, typer.Option(min=1, help="contacts in the folder at the end")] = 100,
-    obj: Annotated[str | None, typer.Option("--object", metavar="O", help="object; the experiment's own if not given")] = None,
+    count: Annotated[int, Option(min=1, help="contacts in the folder at the end")] = 100,
+    obj: Annotated[str | None, Option("--object", metavar="O", help="object; the experiment's own if not given")] = None,
     servo: options.ServoName = "surface",
     form: options.FormOrAuto = None,
     safety: Limits = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="seed of the sampled contacts; the experiment's own if not given")] = None,
-    design: Annotated[str, typer.Option(help="random, or even (spread over the ranges)")] = "random",
+    seed: Annotated[int | None, Option(min=0, help="seed of the sampled contacts; the experiment's own if not given")] = None,
+    design: Annotated[str, Option(help="random, or even (spread over the ranges)")] = "random",
     plain_light: options.PlainLight = False,
     also: options.Also = None,
     ros2: Ros2 = None,
@@ -171,15 +170,15 @@ def ended_early(followed: "Followed") -> int:
 
 @app.command("servo", exit_code=ended_early)
 def servo(
-    obj: Annotated[str, typer.Option("--object", metavar="O", help="can, mesh-can, square, prism, tin-box, or another")],
+    obj: Annotated[str, Option("--object", metavar="O", help="can, mesh-can, square, prism, tin-box, or another")],
     out: options.Out,
     model: Model = SHIPPED_MODEL,
     camera: Camera = "",
     arm: ArmOption = "simulated",
     servo: options.ServoName = "surface",
     steps: Steps = None,
-    stream: Annotated[bool, typer.Option("--stream", help="decide at a fixed rate on the newest frame, without waiting for moves")] = False,
-    rate: Annotated[float, typer.Option(min=0.1, help="decisions a second with --stream")] = 10.0,
+    stream: Annotated[bool, Option("--stream", help="decide at a fixed rate on the newest frame, without waiting for moves")] = False,
+    rate: Annotated[float, Option(min=0.1, help="decisions a second with --stream")] = 10.0,
     safety: Limits = None,
     record: Record = False,
     seed: NoiseSeed = 0,
@@ -233,14 +232,14 @@ def servo(
     stream_hz = rate if stream else None
     plan = call(FollowPlan, locals())
     with signals_as_ctrl_c():
-        followed = follow(plan, load_with_history(model), out, about={"model": str(model)}, progress=progress)
-    return followed  # type: ignore[return-value]  # a dry run has nothing but its lines
+        # a dry run has nothing but its lines
+        return follow(plan, load_with_history(model), out, about={"model": str(model)}, progress=progress)  # type: ignore[return-value]
 
 
 @app.command("policy", exit_code=ended_early)
 def run_policy(
-    policy: Annotated[Path, typer.Argument(help="policy.safetensors of 'twin learn'")],
-    obj: Annotated[str, typer.Option("--object", metavar="O", help="can, square, prism, tin-box, or another")],
+    policy: Annotated[Path, Argument(help="policy.safetensors of 'twin learn'")],
+    obj: Annotated[str, Option("--object", metavar="O", help="can, square, prism, tin-box, or another")],
     out: options.Out,
     camera: Camera = "",
     arm: ArmOption = "simulated",
@@ -276,22 +275,22 @@ def run_policy(
 
     plan = call(FollowPlan, locals())
     with signals_as_ctrl_c():
-        followed = follow(plan, load_for_outlines(policy, contacts_of), out, about={"policy": str(policy)}, progress=progress)
-    return followed  # type: ignore[return-value]  # a dry run has nothing but its lines
+        learnt = load_for_outlines(policy, contacts_of)
+        return follow(plan, learnt, out, about={"policy": str(policy)}, progress=progress)  # type: ignore[return-value]  # as above
 
 
 @app.command("grasp")
 def grasp(
-    policy: Annotated[str, typer.Argument(help="ZIP file of stable-baselines3 (PPO), or the name of a package's policy")],
+    policy: Annotated[str, Argument(help="ZIP file of stable-baselines3 (PPO), or the name of a package's policy")],
     out: options.Out,
     sensor: options.Sensor = str(SHIPPED_MODEL),
     gripper: Annotated[
-        str, typer.Option("--gripper", metavar="G", help="mujoco:SCENE, output:N,OPEN_MM,CLOSED_MM (of an MG400), ros2:TOPIC[,JOINTS]")
+        str, Option("--gripper", metavar="G", help="mujoco:SCENE, output:N,OPEN_MM,CLOSED_MM (of an MG400), ros2:TOPIC[,JOINTS]")
     ] = "mujoco:gripper",
-    left: Annotated[str, typer.Option(metavar="C", help="camera of the left sensor, as --camera of 'twin policy'")] = "",
-    right: Annotated[str, typer.Option(metavar="C", help="camera of the right sensor")] = "",
+    left: Annotated[str, Option(metavar="C", help="camera of the left sensor, as --camera of 'twin policy'")] = "",
+    right: Annotated[str, Option(metavar="C", help="camera of the right sensor")] = "",
     arm: ArmOption = "simulated",
-    object_mm: Annotated[float, typer.Option(min=1, max=200, help="width of the object between the fingers")] = 40.0,
+    object_mm: Annotated[float, Option(min=1, max=200, help="width of the object between the fingers")] = 40.0,
     safety: Limits = None,
     also: options.Also = None,
     ros2: Ros2 = None,
@@ -325,41 +324,35 @@ def grasp(
 
     plan, decide = call(GripPlan, locals()), GraspPolicy(load_grasp_policy(policy), object_mm)
     with signals_as_ctrl_c():
-        gripped = grip(plan, decide, out, steps=decide.steps, period_s=PERIOD_S, progress=progress)
-    return gripped  # type: ignore[return-value]  # a dry run has nothing but its lines
+        return grip(plan, decide, out, steps=decide.steps, period_s=PERIOD_S, progress=progress)  # type: ignore[return-value]  # as above
 
 
-emulate = App(
-    cls=FewCommands,
-    help="Emulate a device on this machine.\n\nIt prints 'ready ...' when it listens, and runs until SIGTERM or Ctrl-C.",
-    no_args_is_help=True,
-)
-app.add_typer(emulate, name="emulate")
+emulate = group("emulate", "Emulate a device on this machine.\n\nIt prints 'ready ...' when it listens, and runs until SIGTERM or Ctrl-C.")
 
 FaultOption = Annotated[
-    list[str] | None, typer.Option("--fault", metavar="NAME[=VALUE]", help="switch a fault on; '--fault help' lists them; may be repeated")
+    list[str] | None, Option("--fault", metavar="NAME[=VALUE]", help="switch a fault on; '--fault help' lists them; may be repeated")
 ]
-TimeScale = Annotated[float, typer.Option("--time-scale", help="speed relative to the real arm", min=1e-3)]
+TimeScale = Annotated[float, Option("--time-scale", help="speed relative to the real arm", min=1e-3)]
 
 
 def faults_of(wanted: list[str] | None, known: dict[str, "Fault"]) -> tuple[str, ...]:
     """The faults that the user asks for. If the user asks for help, the known faults are printed and the command ends."""
-    from hardware.emulators.running import fault_lines
+    from hardware.emulators.faults import fault_lines
 
     if wanted and "help" in wanted:
         print_lines(fault_lines(known))
-        raise typer.Exit
+        raise Exit
     return tuple(wanted or ())
 
 
 @emulate.command("mg400")
 def mg400(
-    host: Annotated[str, typer.Option(help="address to listen on")] = "127.0.0.1",
-    port_offset: Annotated[int, typer.Option(help="added to 29999 and 30003 to 30006")] = 0,
+    host: Annotated[str, Option(help="address to listen on")] = "127.0.0.1",
+    port_offset: Annotated[int, Option(help="added to 29999 and 30003 to 30006")] = 0,
     fault: FaultOption = None,
-    firmware: Annotated[str, typer.Option(help="emulated version; below 1.5.6 replies are bare echoes, and moves get none")] = "1.7.0",
+    firmware: Annotated[str, Option(help="emulated version; below 1.5.6 replies are bare echoes, and moves get none")] = "1.7.0",
     lenient: Annotated[
-        bool, typer.Option("--lenient", help="like firmware 1.5.5, but with echoes of moves too, for clients that wait for them")
+        bool, Option("--lenient", help="like firmware 1.5.5, but with echoes of moves too, for clients that wait for them")
     ] = False,
     time_scale: TimeScale = 1.0,
 ) -> None:
@@ -373,15 +366,14 @@ def mg400(
     Example:
       twin emulate mg400
     """
-    from hardware.emulators.mg400 import FAULTS
-    from hardware.emulators.running import emulate_mg400
+    from hardware.emulators.mg400 import FAULTS, Mg400Emulator
 
-    call(emulate_mg400, locals(), faults=faults_of(fault, FAULTS))
+    call(Mg400Emulator, locals(), faults=faults_of(fault, FAULTS)).run()
 
 
 @emulate.command("magician")
 def magician(
-    link: Annotated[Path | None, typer.Option(help="symbolic link to make to the pseudo-terminal")] = None,
+    link: Annotated[Path | None, Option(help="symbolic link to make to the pseudo-terminal")] = None,
     fault: FaultOption = None,
     time_scale: TimeScale = 1.0,
 ) -> None:
@@ -395,16 +387,15 @@ def magician(
     Example:
       twin emulate magician --link /tmp/magician
     """
-    from hardware.emulators.magician import FAULTS
-    from hardware.emulators.running import emulate_magician
+    from hardware.emulators.magician import FAULTS, MagicianEmulator
 
-    call(emulate_magician, locals(), faults=faults_of(fault, FAULTS))
+    call(MagicianEmulator, locals(), faults=faults_of(fault, FAULTS)).run()
 
 
 @emulate.command("ros2")
 def ros2_arm(
-    form: Annotated[str, typer.Option(help="commands: twist, as for MoveIt Servo, or pose, as for a cartesian controller")] = "twist",
-    namespace: Annotated[str, typer.Option(help="namespace of its topics")] = "",
+    form: Annotated[str, Option(help="commands: twist, as for MoveIt Servo, or pose, as for a cartesian controller")] = "twist",
+    namespace: Annotated[str, Option(help="namespace of its topics")] = "",
     fault: FaultOption = None,
 ) -> None:
     """Emulate an arm behind ROS 2.
@@ -418,16 +409,14 @@ def ros2_arm(
       twin emulate ros2 --namespace left
       twin servo --object can --arm ros2:twist,namespace=left --out out/servo
     """
-    from hardware.emulators.ros2 import FAULTS, emulate_ros2
+    from hardware.emulators.ros2 import FAULTS, Ros2Emulator
 
-    call(emulate_ros2, locals(), faults=faults_of(fault, FAULTS))
+    call(Ros2Emulator, locals(), faults=faults_of(fault, FAULTS)).run()
 
 
 @emulate.command("ur")
 def ur(
-    host: Annotated[
-        str, typer.Option(help="address to listen on; a second emulated UR needs another one, such as 127.0.0.2")
-    ] = "127.0.0.1",
+    host: Annotated[str, Option(help="address to listen on; a second emulated UR needs another one, such as 127.0.0.2")] = "127.0.0.1",
     fault: FaultOption = None,
     time_scale: TimeScale = 1.0,
 ) -> None:
@@ -441,19 +430,19 @@ def ur(
     Example:
       twin emulate ur
     """
-    from hardware.emulators.ur import FAULTS, emulate_ur
+    from hardware.emulators.ur import FAULTS, UrEmulator
 
-    call(emulate_ur, locals(), faults=faults_of(fault, FAULTS))
+    call(UrEmulator, locals(), faults=faults_of(fault, FAULTS)).run()
 
 
 @emulate.command("camera")
 def camera(
-    arm: Annotated[str, typer.Option(metavar="A", help="mg400:ADDRESS[:DASHBOARD_PORT]")],
+    arm: Annotated[str, Option(metavar="A", help="mg400:ADDRESS[:DASHBOARD_PORT]")],
     sensor: options.Sensor,
     obj: options.Object,
-    host: Annotated[str, typer.Option(help="address to listen on")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0: a free one")] = 8081,
-    fps: Annotated[float, typer.Option(min=0.1, help="largest number of pictures a second")] = 30.0,
+    host: Annotated[str, Option(help="address to listen on")] = "127.0.0.1",
+    port: Annotated[int, Option(min=0, max=65535, help="0: a free one")] = 8081,
+    fps: Annotated[float, Option(min=0.1, help="largest number of pictures a second")] = 30.0,
     servo: options.ServoName = "surface",
     fault: FaultOption = None,
     plain_light: options.PlainLight = False,

@@ -10,7 +10,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-import typer
+from typer import BadParameter, Option
 
 from twin.errors import OptionError
 from twin.types import Form
@@ -39,18 +39,18 @@ MOST_THREADS = 256
 
 QUALITY = "rasterised without noise, or path-traced with more and more samples"
 
-Sensor = Annotated[str, typer.Option("--sensor", metavar="S", help="sensor name ('twin sensors') or specification file")]
-Object = Annotated[str, typer.Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")]
+Sensor = Annotated[str, Option("--sensor", metavar="S", help="sensor name ('twin sensors') or specification file")]
+Object = Annotated[str, Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")]
 TouchedObject = Annotated[
-    str | None, typer.Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
+    str | None, Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
 ]
-Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="folder to write to; made if missing")]
-Force = Annotated[bool, typer.Option("--force", help="overwrite files that this program did not write")]
-FormOrAuto = Annotated[Form | None, typer.Option("--form", help="form of the frames; found from size and content if not given")]
-Experiment = Annotated[str, typer.Option("--experiment", metavar="E", help="how contacts are made: a name ('twin experiments') or a file")]
-MaxFrames = Annotated[int, typer.Option("--max-frames", min=1, metavar="N", help="at most N frames, evenly spread"), Formerly("limit")]
-Residual = Annotated[bool, typer.Option("--residual", help="add the sensor's residual network")]
-Device = Annotated[str, typer.Option("--device", help="auto (a GPU where PyTorch finds one), cpu or cuda")]
+Out = Annotated[Path, Option("--out", metavar="DIR", help="folder to write to; made if missing")]
+Force = Annotated[bool, Option("--force", help="overwrite files that this program did not write")]
+FormOrAuto = Annotated[Form | None, Option("--form", help="form of the frames; found from size and content if not given")]
+Experiment = Annotated[str, Option("--experiment", metavar="E", help="how contacts are made: a name ('twin experiments') or a file")]
+MaxFrames = Annotated[int, Option("--max-frames", min=1, metavar="N", help="at most N frames, evenly spread"), Formerly("limit")]
+Residual = Annotated[bool, Option("--residual", help="add the sensor's residual network")]
+Device = Annotated[str, Option("--device", help="auto (a GPU where PyTorch finds one), cpu or cuda")]
 
 
 def each_once(text: str | None) -> str | None:
@@ -59,36 +59,34 @@ def each_once(text: str | None) -> str | None:
         return None
     names = names_in(text)
     if not names or len(set(names)) < len(names):
-        raise typer.BadParameter(f"give one name or several with commas between, each once, got {text!r}")
+        raise BadParameter(f"give one name or several with commas between, each once, got {text!r}")
     return ",".join(names)
 
 
 def finite(value: float | None) -> float | None:
     """The number, if it is not NaN or infinite. This is checked here, because a least value of an option lets NaN pass."""
     if value is not None and not math.isfinite(value):
-        raise typer.BadParameter(f"give a number, got {value}")
+        raise BadParameter(f"give a number, got {value}")
     return value
 
 
-Target = Annotated[str, typer.Option("--target", callback=each_once, help="preset, or label columns separated by commas")]
-Threads = Annotated[int | None, typer.Option("--threads", min=1, max=MOST_THREADS, help="CPU threads")]
-Workers = Annotated[int, typer.Option("--workers", min=1, metavar="N", show_default="one for each core", help="processes on this machine")]
+Target = Annotated[str, Option("--target", callback=each_once, help="preset, or label columns separated by commas")]
+Threads = Annotated[int | None, Option("--threads", min=1, max=MOST_THREADS, help="CPU threads")]
+Workers = Annotated[int, Option("--workers", min=1, metavar="N", show_default="one for each core", help="processes on this machine")]
 Pair = tuple[float, float]
-Table = Annotated[Path | None, typer.Option("--table", metavar="CSV", help="table of labels, if it is not targets.csv beside the frames")]
+Table = Annotated[Path | None, Option("--table", metavar="CSV", help="table of labels, if it is not targets.csv beside the frames")]
 NoContact = Annotated[
-    Path | None, typer.Option("--no-contact", metavar="FRAME", help="frame without contact, if it is not init_0.png beside the frames")
+    Path | None, Option("--no-contact", metavar="FRAME", help="frame without contact, if it is not init_0.png beside the frames")
 ]
-Tuning = Annotated[
-    Path | None, typer.Option("--pipeline", metavar="FILE.toml", help="pin detection of 'twin tune', instead of the sensor's own")
-]
+Tuning = Annotated[Path | None, Option("--pipeline", metavar="FILE.toml", help="pin detection of 'twin tune', instead of the sensor's own")]
 # Further formats in which a record can be kept, as in ``twin.records.ALSO``, whose import would load the pin detection.
 AlsoFormat = StrEnum("AlsoFormat", {"LEROBOT": "lerobot", "HUGGINGFACE": "huggingface", "MCAP": "mcap"})
 Also = Annotated[
     list[AlsoFormat] | None,
-    typer.Option("--also", help="also write this format, in a subfolder of that name; may be repeated ('twin convert --help')"),
+    Option("--also", help="also write this format, in a subfolder of that name; may be repeated ('twin convert --help')"),
 ]
-PlainLight = Annotated[bool, typer.Option("--plain-light", help="render the twin's frames with direct light alone, without path tracing")]
-ServoName = Annotated[str, typer.Option("--servo", help="gains, speeds and the object's place: a name, or a TOML file")]
+PlainLight = Annotated[bool, Option("--plain-light", help="render the twin's frames with direct light alone, without path tracing")]
+ServoName = Annotated[str, Option("--servo", help="gains, speeds and the object's place: a name, or a TOML file")]
 
 
 def _even(value: int) -> int:
@@ -99,9 +97,7 @@ def _even(value: int) -> int:
 
 
 Elements = Annotated[
-    int,
-    typer.Option("--elements", min=6, max=64, callback=_even, help="elements along each side of the skin's grid; even"),
-    Formerly("across"),
+    int, Option("--elements", min=6, max=64, callback=_even, help="elements along each side of the skin's grid; even"), Formerly("across")
 ]
 
 

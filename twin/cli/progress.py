@@ -4,7 +4,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from typing import TextIO
 
 from rich import progress
@@ -133,16 +133,10 @@ def show_progress(*, goes_on: bool = False) -> Iterator[Told]:
     ``goes_on``: the same command continues interrupted work, and Ctrl-C says so.
     """
     console = Console(stderr=True)
+    shown: AbstractContextManager[Told] = closing(Bars(console)) if console.is_terminal else Lines(sys.stderr)
     try:
-        if not console.is_terminal:
-            with Lines(sys.stderr) as lines:
-                yield lines
-            return
-        bars = Bars(console)
-        try:
-            yield bars
-        finally:
-            bars.close()
+        with shown as told:
+            yield told
     except KeyboardInterrupt as interrupt:
         if goes_on:
             interrupt.add_note(GOES_ON)

@@ -9,11 +9,11 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import BadParameter, Option
 
-from twin.cli import FewCommands, app, options
-from twin.cli.command import App
+from twin.cli import group, options
 from twin.cli.options import Formerly, call, each_once, finite, names_in
+from twin.errors import ErrorsAs
 from twin.progress import Progress
 from twin.types import FINE
 
@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from hardware.servo.following import ServoStudy
     from training.studies import objects, sim_to_real, tac_vgnn
 
-study = App(cls=FewCommands, help="Experiments that compare models.", no_args_is_help=True, rich_markup_mode=None)
-app.add_typer(study, name="study")
+study = group("study", "Experiments that compare models.")
 
 # The objects of the Tac-VGNN paper.
 OBJECTS = "can,mesh-can,square,prism,tin-box"
@@ -30,12 +29,12 @@ OBJECTS = "can,mesh-can,square,prism,tin-box"
 
 @study.command("servo")
 def study_servo_command(
-    models: Annotated[list[Path], typer.Option("--model", metavar="RUN", help="folder of a training run; give it once for each model")],
+    models: Annotated[list[Path], Option("--model", metavar="RUN", help="folder of a training run; give it once for each model")],
     out: options.Out,
-    objects: Annotated[str, typer.Option(callback=each_once, help="names separated by commas")] = OBJECTS,
+    objects: Annotated[str, Option(callback=each_once, help="names separated by commas")] = OBJECTS,
     servo: options.ServoName = "surface",
-    steps: Annotated[int | None, typer.Option(min=1, help="steps on each object, instead of once around it")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="seed of the twin's noise")] = 0,
+    steps: Annotated[int | None, Option(min=1, help="steps on each object, instead of once around it")] = None,
+    seed: Annotated[int, Option(min=0, help="seed of the twin's noise")] = 0,
     plain_light: options.PlainLight = False,
     *,
     progress: Progress,
@@ -64,14 +63,14 @@ UNSEEN = "cylinder,edge"
 def study_objects(
     sensor: options.Sensor,
     out: options.Out,
-    train: Annotated[str, typer.Option(help="training objects, separated by commas; the first also alone")] = TRAIN,
-    unseen: Annotated[str, typer.Option(help="unseen objects, separated by commas")] = UNSEEN,
-    count: Annotated[int, typer.Option(min=2, metavar="N", help="training contacts of each object")] = 100,
-    tests: Annotated[int, typer.Option(min=1, metavar="N", help="held-out contacts of each object for the evaluation")] = 50,
-    experiment: Annotated[str, typer.Option(metavar="E", help="contacts for the evaluation ('twin experiments')")] = "objects-2d",
-    randomise: Annotated[str, typer.Option(metavar="R", help="domain randomisation ('twin randomisations')")] = "moves",
-    seed: Annotated[int, typer.Option(min=0, max=options.MOST_SEED, help="seed of the contacts and the weights")] = 0,
-    epochs: Annotated[int | None, typer.Option(min=1, help="epochs of both trainings, instead of the study's own")] = None,
+    train: Annotated[str, Option(help="training objects, separated by commas; the first also alone")] = TRAIN,
+    unseen: Annotated[str, Option(help="unseen objects, separated by commas")] = UNSEEN,
+    count: Annotated[int, Option(min=2, metavar="N", help="training contacts of each object")] = 100,
+    tests: Annotated[int, Option(min=1, metavar="N", help="held-out contacts of each object for the evaluation")] = 50,
+    experiment: Annotated[str, Option(metavar="E", help="contacts for the evaluation ('twin experiments')")] = "objects-2d",
+    randomise: Annotated[str, Option(metavar="R", help="domain randomisation ('twin randomisations')")] = "moves",
+    seed: Annotated[int, Option(min=0, max=options.MOST_SEED, help="seed of the contacts and the weights")] = 0,
+    epochs: Annotated[int | None, Option(min=1, help="epochs of both trainings, instead of the study's own")] = None,
     workers: options.Workers = options.CORES,
     elements: options.Elements = FINE,
     *,
@@ -111,22 +110,20 @@ def study_objects(
 @study.command("sim-to-real", goes_on=True)
 def study_sim_to_real(
     sensor: options.Sensor,
-    frames: Annotated[Path, typer.Option(metavar="DIR", help="labelled real recording")],
+    frames: Annotated[Path, Option(metavar="DIR", help="labelled real recording")],
     out: options.Out,
-    num_labelled: Annotated[int, typer.Option(min=8, metavar="N", help="labelled real frames"), Formerly("labels")] = 40,
-    seed: Annotated[int, typer.Option(min=0, max=options.MOST_SEED, help="seed of the choice of frames, the contacts and the weights")] = 0,
-    experiment: Annotated[str, typer.Option(metavar="E", help="experiment of the recording")] = "surface-2d",
-    contacts: Annotated[
-        str | None, typer.Option(metavar="E", help="experiment to simulate; by default one wider than --experiment")
-    ] = None,
-    draws: Annotated[int, typer.Option(min=1, help="samples of the pins' discrepancy for each contact")] = 2,
-    count: Annotated[int, typer.Option(min=10, metavar="N", help="contacts to simulate")] = 500,
+    num_labelled: Annotated[int, Option(min=8, metavar="N", help="labelled real frames"), Formerly("labels")] = 40,
+    seed: Annotated[int, Option(min=0, max=options.MOST_SEED, help="seed of the choice of frames, the contacts and the weights")] = 0,
+    experiment: Annotated[str, Option(metavar="E", help="experiment of the recording")] = "surface-2d",
+    contacts: Annotated[str | None, Option(metavar="E", help="experiment to simulate; by default one wider than --experiment")] = None,
+    draws: Annotated[int, Option(min=1, help="samples of the pins' discrepancy for each contact")] = 2,
+    count: Annotated[int, Option(min=10, metavar="N", help="contacts to simulate")] = 500,
     sim: Annotated[
-        list[Path] | None, typer.Option(metavar="DIR", exists=True, file_okay=False, help="existing simulated data set; several are joined")
+        list[Path] | None, Option(metavar="DIR", exists=True, file_okay=False, help="existing simulated data set; several are joined")
     ] = None,
-    calibrate: Annotated[bool, typer.Option("--calibrate", help="fit the specification to the labelled frames first")] = False,
-    ablate: Annotated[bool, typer.Option("--ablate", help="also train without one ingredient at a time (ablation)")] = False,
-    epochs: Annotated[int | None, typer.Option(min=1, help="epochs of every training, instead of the model's own")] = None,
+    calibrate: Annotated[bool, Option("--calibrate", help="fit the specification to the labelled frames first")] = False,
+    ablate: Annotated[bool, Option("--ablate", help="also train without one ingredient at a time (ablation)")] = False,
+    epochs: Annotated[int | None, Option(min=1, help="epochs of every training, instead of the model's own")] = None,
     workers: options.Workers = options.CORES,
     elements: options.Elements = FINE,
     *,
@@ -181,12 +178,11 @@ def study_sim_to_real(
 
 def numbers_in(text: str, option: str, least: int) -> tuple[int, ...]:
     """The comma-separated whole numbers, each at least ``least`` and at most the largest seed."""
-    try:
+    refusal = BadParameter(f"takes whole numbers with commas between, got {text!r}", param_hint=option)
+    with ErrorsAs(ValueError, lambda error: refusal):
         numbers = tuple(int(part) for part in names_in(text))
-    except ValueError as error:
-        raise typer.BadParameter(f"takes whole numbers with commas between, got {text!r}", param_hint=option) from error
     if any(not least <= number <= options.MOST_SEED for number in numbers):
-        raise typer.BadParameter(f"takes whole numbers from {least} to {options.MOST_SEED}, got {text!r}", param_hint=option)
+        raise BadParameter(f"takes whole numbers from {least} to {options.MOST_SEED}, got {text!r}", param_hint=option)
     return numbers
 
 
@@ -195,20 +191,18 @@ MODELS = "gnn,tac-vgnn,vgnn,cnn-v2,cnn-v1"
 
 @study.command("tac-vgnn", goes_on=True)
 def study_tac_vgnn(
-    data: Annotated[Path, typer.Option(metavar="DIR", help="labelled recording")],
+    data: Annotated[Path, Option(metavar="DIR", help="labelled recording")],
     sensor: options.Sensor,
     out: options.Out,
-    models: Annotated[str, typer.Option(help="names separated by commas")] = MODELS,
-    seeds: Annotated[str, typer.Option(help="seeds of weights and order, separated by commas")] = "0",
-    label_kind: Annotated[str, typer.Option(help="labels to train on: raw (as in the paper) or corrected"), Formerly("labels")] = "raw",
+    models: Annotated[str, Option(help="names separated by commas")] = MODELS,
+    seeds: Annotated[str, Option(help="seeds of weights and order, separated by commas")] = "0",
+    label_kind: Annotated[str, Option(help="labels to train on: raw (as in the paper) or corrected"), Formerly("labels")] = "raw",
     target: options.Target = "surface-2d",
-    split: Annotated[int, typer.Option(min=0, max=options.MOST_SEED, help="seed of the held-out fifth")] = 0,
-    epochs: Annotated[int | None, typer.Option(min=1, help="epochs of training, instead of each model's own number")] = None,
-    max_minutes: Annotated[float | None, typer.Option(min=0, callback=finite, help="time for all trainings together")] = None,
-    batches: Annotated[
-        str, typer.Option(help="batch sizes of the efficiency figure, separated by commas; empty: no figure")
-    ] = "64,256,512",
-    contacts: Annotated[bool, typer.Option("--contacts/--no-contacts", help="press and render the contacts of the area figure")] = True,
+    split: Annotated[int, Option(min=0, max=options.MOST_SEED, help="seed of the held-out fifth")] = 0,
+    epochs: Annotated[int | None, Option(min=1, help="epochs of training, instead of each model's own number")] = None,
+    max_minutes: Annotated[float | None, Option(min=0, callback=finite, help="time for all trainings together")] = None,
+    batches: Annotated[str, Option(help="batch sizes of the efficiency figure, separated by commas; empty: no figure")] = "64,256,512",
+    contacts: Annotated[bool, Option("--contacts/--no-contacts", help="press and render the contacts of the area figure")] = True,
     device: options.Device = "auto",
     threads: options.Threads = None,
     form: options.FormOrAuto = None,

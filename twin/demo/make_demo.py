@@ -29,7 +29,7 @@ from twin.report.skin3d import draw_contact_skin
 from twin.report.table import Column, force_interval, number
 from twin.simulator import RenderedFrame, Simulator
 from twin.store import writes
-from twin.types import ContactState, Form, ReadableResult
+from twin.types import ContactState, Form, ImageArray, ReadableResult
 
 Result = TypeVar("Result")
 
@@ -189,10 +189,9 @@ def run_demo(out: Path, *, progress: Progress = silent) -> Demo:
     add_tables(page, tables)
 
     renderer = simulators[motion_sensor].describe()["renderer"]
-    machine = f"Rendered with Mitsuba variant {renderer['variant']} on {os.cpu_count()} cores ({platform.machine()}). " + " ".join(
-        sorted(notes)
-    )
-    return Demo(tables, [write_page(out / "index.html", page, machine, seconds), *sorted(pictures.iterdir())])
+    machine = f"Rendered with Mitsuba variant {renderer['variant']} on {os.cpu_count()} cores ({platform.machine()})."
+    written = write_page(out / "index.html", page, " ".join([machine, *sorted(notes)]), seconds)
+    return Demo(tables, [written, *sorted(pictures.iterdir())])
 
 
 def motion_figure(motions: list[tuple[str, plots.ObservedFrame]]) -> Figure:
@@ -235,69 +234,61 @@ def write_page(path: Path, page: Page, machine: str, seconds: dict[str, float]) 
     page.section("Time")
     stages = [{"stage": name, "seconds": value} for name, value in (seconds | {"all": sum(seconds.values())}).items()]
     page.table(stages, [Column("stage", "stage"), Column("seconds", "time", "s", decimals=2)])
-    page.section(
-        "What to try next", "The tutorials in docs/tutorials go through each of these; 'make docs' builds the whole documentation."
-    )
+    page.section("What to try next", "The tutorials in docs/tutorials go through each of these; 'make docs' builds all documents.")
     page.items([sentence(code(command) + ":", what + ".") for command, what in NEXT])
     return page.write(path, embed=True)
 
 
 def add_contact(page: Page, result: ContactResult, skin: Path) -> None:
     """Add a section about a contact. Its pictures are written beside that of the skin."""
-    look, spec, folder, stem = result.look, result.sensor, skin.parent, f"{result.sensor.name}-{result.obj.name}"
+    look, spec, stem = result.look, result.sensor, f"{result.sensor.name}-{result.obj.name}"
     title = f"{spec.name} against {result.obj.name}"
-    page.section(title, f"{spec.description}. {result.obj.description}, pressed in by {result.pose.indent_mm:g} mm.")
     height, width = result.raw.frame.image.shape[:2]
-    raw = write_image(folder / f"{stem}-frame.png", result.raw.frame.image)
-    shown = [
-        PagePicture(
-            skin, f"{title}: deformed skin in 3D", "The skin, cut open, coloured by its displacement, with pins and object.", "photo"
-        ),
-        PagePicture(raw, f"{title}: rendered camera frame", f"What the camera inside sees ({width} x {height} px).", "frame"),
-    ]
-    if look.frame.form == Form.PROCESSED:
-        recorded = write_image(folder / f"{stem}-recorded.png", look.frame.image)
-        said = "The same frame in the form of this sensor's recordings: cropped, adaptively thresholded, resized."
-        shown.append(PagePicture(recorded, f"{title}: frame in the form of a recording", said, "frame"))
-    page.figures(*shown, layout="row")
     graph, rest = look.graphs()
-    page.figures(
-        PagePicture(
-            write_chart(folder / f"{stem}-graph.png", lambda: _graph_figure(look)),
-            f"{title}: pins and Voronoi graph",
-            "Pins found (green), graph edges (blue) and Voronoi cells (white); yellow crosses are spots that are not pins.",
-        ),
-        PagePicture(
-            write_chart(folder / f"{stem}-areas.png", lambda: _areas_figure(look)),
-            f"{title}: Voronoi area change",
-            "Voronoi cell areas against no contact: cells grow where the dome flattens.",
-        ),
-        layout="row",
-    )
-    page.figures(
-        PagePicture(
-            write_chart(folder / f"{stem}-surfaces.png", lambda: plots.area_surface_figure(rest, graph)),
-            f"{title}: interpolated area surfaces",
-            "Cell area interpolated over the image: no contact, contact, difference.",
-        )
-    )
+
+    def frame(name: str, image: ImageArray, shown: str, said: str) -> PagePicture:
+        return PagePicture(write_image(skin.parent / f"{stem}-{name}.png", image), f"{title}: {shown}", said, "frame")
+
+    def chart(name: str, make: Callable[[], Figure], shown: str, said: str) -> PagePicture:
+        return PagePicture(write_chart(skin.parent / f"{stem}-{name}.png", make), f"{title}: {shown}", said)
+
+    def graph_figure() -> Figure:
+        figure, (ax,) = new_figure(1, panel_inch=6)
+        plots.draw_frame(ax, look.frame.image, around_px=rest.nodes_px)
+        plots.draw_graph(ax, graph)
+        plots.draw_pins(ax, look.observation)
+        return figure
+
+    def areas_figure() -> Figure:
+        figure, (ax,) = new_figure(1, panel_inch=6)
+        plots.draw_area_change(ax, graph, rest.area_px2, "")
+        return figure
+
+    page.section(title, f"{spec.description}. {result.obj.description}, pressed in by {result.pose.indent_mm:g} mm.")
+    said = "The skin, cut open, coloured by its displacement, with pins and object."
+    shown = [PagePicture(skin, f"{title}: deformed skin in 3D", said, "photo")]
+    shown.append(frame("frame", result.raw.frame.image, "rendered camera frame", f"What the camera inside sees ({width} x {height} px)."))
+    if look.frame.form == Form.PROCESSED:
+        said = "The same frame in the form of this sensor's recordings: cropped, adaptively thresholded, resized."
+        shown.append(frame("recorded", look.frame.image, "frame in the form of a recording", said))
+    page.figures(*shown, layout="row")
+    found = "Pins found (green), graph edges (blue) and Voronoi cells (white); yellow crosses are spots that are not pins."
+    change = "Voronoi cell areas against no contact: cells grow where the dome flattens."
+    surfaces = "Cell area interpolated over the image: no contact, contact, difference."
+    pins = chart("graph", graph_figure, "pins and Voronoi graph", found)
+    page.figures(pins, chart("areas", areas_figure, "Voronoi area change", change), layout="row")
+    page.figures(chart("surfaces", lambda: plots.area_surface_figure(rest, graph), "interpolated area surfaces", surfaces))
     rows = [{"name": name, "value": value} for name, value in contact_figures(result)]
     page.table(rows, [Column("name", "figure"), Column("value", "value")])
 
 
 def add_motions(page: Page, motions: Path) -> None:
     """Add the chart of `motion_figure`."""
-    page.section(
-        "Three motions, three signatures",
-        "Pressing (Z) spreads the pins outwards. Dragging along x or y carries them with the object until they slip.",
-    )
-    page.figures(
-        PagePicture(
-            motions,
-            "Displacement of the pins and change of the Voronoi areas for motions along Z, X and Y",
-            f"Pin displacement (top) and Voronoi area change (bottom) for motions along Z, X and Y, on {CONTACTS[0][0]}.",
-        )
-    )
+    lead = "Pressing (Z) spreads the pins outwards. Dragging along x or y carries them with the object until they slip."
+    page.section("Three motions, three signatures", lead)
+    shown = "Displacement of the pins and change of the Voronoi areas for motions along Z, X and Y"
+    said = f"Pin displacement (top) and Voronoi area change (bottom) for motions along Z, X and Y, on {CONTACTS[0][0]}."
+    page.figures(PagePicture(motions, shown, said))
 
 
 def add_tables(page: Page, tables: Mapping[str, Sequence[DepthRow]]) -> None:
@@ -321,19 +312,3 @@ def add_tables(page: Page, tables: Mapping[str, Sequence[DepthRow]]) -> None:
     ]
     for sensor, rows in tables.items():
         page.table([vars(row) for row in rows], columns, caption=sensor)
-
-
-def _graph_figure(look: plots.ObservedFrame) -> Figure:
-    figure, (ax,) = new_figure(1, panel_inch=6)
-    graph, rest = look.graphs()
-    plots.draw_frame(ax, look.frame.image, around_px=rest.nodes_px)
-    plots.draw_graph(ax, graph)
-    plots.draw_pins(ax, look.observation)
-    return figure
-
-
-def _areas_figure(look: plots.ObservedFrame) -> Figure:
-    figure, (ax,) = new_figure(1, panel_inch=6)
-    graph, rest = look.graphs()
-    plots.draw_area_change(ax, graph, rest.area_px2, "")
-    return figure

@@ -1,6 +1,6 @@
 """Hexahedral mesh of the sensor's body, for views, files and the renderer. The mesh is the same for every contact.
 
-A square grid is mapped to the skin (``chart``, ``shapes``). At each of its points a straight column of nodes passes through the skin and
+A square grid is mapped to the skin (``shapes``). At each of its points a straight column of nodes passes through the skin and
 the gel to the lens. The mechanics use the spline solid (``solid``); `NodeView` computes the positions of the nodes from it.
 """
 
@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scenes.sensor import GeometrySpec
-from twin.geometry.chart import Chart, Focus, RectangleChart
-from twin.geometry.shapes import shape_of
+from twin.geometry.shapes import Chart, Focus, RectangleChart, shape_of
 from twin.geometry.solid import Solid, body_points, surface_operators
 from twin.types import ComplexArray, FloatArray, IntArray
 
@@ -52,7 +51,7 @@ class SensorMesh:
         Inside of the skin, one quad for each column of elements. Seen from *outside* the dome the corners run counter-clockwise, so
         normals point away from the dome's centre and the camera sees the back of these quads.
     disc : (k,) complex
-        Place of each column of nodes on the skin (see ``chart``).
+        Place of each column of nodes on the skin (see ``shapes``).
     grid : (3,) int
         Number of layers of nodes, and of nodes along each side of the square.
     skin_layers : int
@@ -130,58 +129,27 @@ def skin_surface(
     Point data ``node`` is each point's index in ``mesh.nodes_mm``.
     """
     grid = to_pyvista(mesh, nodes_mm=nodes_mm, point_data={"node": np.arange(len(mesh.nodes_mm)), **(point_data or {})})
-    skin = grid.extract_cells(mesh.material == SKIN).extract_surface(algorithm="dataset_surface")
-    for name in ("vtkOriginalPointIds", "vtkOriginalCellIds"):
-        for data in (skin.point_data, skin.cell_data):
-            if name in data:
-                del data[name]
-    return skin
+    skin = grid.extract_cells(mesh.material == SKIN, pass_point_ids=False, pass_cell_ids=False)
+    return skin.extract_surface(pass_pointid=False, pass_cellid=False, algorithm="dataset_surface")
 
 
-@dataclass(frozen=True)
 class NodeView:
-    """Linear map from the spline solid's controls to the mesh's nodes.
+    """Linear map from the controls of one spline solid of a sensor to the mesh's nodes."""
 
-    Attributes
-    ----------
-    mesh : SensorMesh
-    rest_mm : (n, 3) float
-        The solid's controls at rest.
-    fine, coarse : (k, side^2), (k, coarse_side^2) float
-        Values of the splines at the k nodes of a layer.
-    skin, gel : (layers, functions) float
-        Values of the splines through the depth, at the layers of nodes in the skin and in the gel.
-    """
-
-    mesh: SensorMesh
-    rest_mm: FloatArray
-    fine: FloatArray
-    coarse: FloatArray
-    skin: FloatArray
-    gel: FloatArray
-
-    @classmethod
-    def of(cls, mesh: SensorMesh, solid: Solid) -> "NodeView":
-        """The map for one solid of a sensor."""
+    def __init__(self, mesh: SensorMesh, solid: Solid) -> None:
+        self._mesh_mm, self._rest_mm = mesh.nodes_mm, solid.control_mm
         at = solid.chart.square(mesh.disc)
+        self._fine, self._coarse = surface_operators(solid.basis, at)[0], surface_operators(solid.coarse, at)[0]
         layers = np.linspace(0, 1, mesh.skin_layers + 1)
         count = solid.inner.stop // solid.basis.count**2
-        hats = np.maximum(1 - np.abs(layers[:, None] * (count - 1) - np.arange(count)), 0)
-        below = 1 + np.linspace(0, 1, mesh.grid[0] - mesh.skin_layers)[1:]
-        return cls(
-            mesh,
-            solid.control_mm,
-            surface_operators(solid.basis, at)[0],
-            surface_operators(solid.coarse, at)[0],
-            hats,
-            solid.through.values(below),
-        )
+        self._skin = np.maximum(1 - np.abs(layers[:, None] * (count - 1) - np.arange(count)), 0)
+        self._gel = solid.through.values(1 + np.linspace(0, 1, mesh.grid[0] - mesh.skin_layers)[1:])
 
     def nodes(self, control_mm: FloatArray) -> FloatArray:
         """Nodes (n, 3) of the deformed body."""
-        moved = control_mm - self.rest_mm
-        upper = self.skin.shape[1] * self.fine.shape[1]
-        skin = np.einsum("kc,lcx->lkx", self.fine, moved[:upper].reshape(self.skin.shape[1], -1, 3), optimize=True)
-        deep = np.einsum("kc,lcx->lkx", self.coarse, moved[upper:].reshape(-1, self.coarse.shape[1], 3), optimize=True)
-        layers = np.concatenate([np.tensordot(self.skin, skin, 1), np.tensordot(self.gel, np.concatenate([skin[-1:], deep]), 1)])
-        return self.mesh.nodes_mm + layers.reshape(-1, 3)
+        moved = control_mm - self._rest_mm
+        upper = self._skin.shape[1] * self._fine.shape[1]
+        skin = np.einsum("kc,lcx->lkx", self._fine, moved[:upper].reshape(self._skin.shape[1], -1, 3), optimize=True)
+        deep = np.einsum("kc,lcx->lkx", self._coarse, moved[upper:].reshape(-1, self._coarse.shape[1], 3), optimize=True)
+        layers = np.concatenate([np.tensordot(self._skin, skin, 1), np.tensordot(self._gel, np.concatenate([skin[-1:], deep]), 1)])
+        return self._mesh_mm + layers.reshape(-1, 3)

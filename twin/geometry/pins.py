@@ -119,34 +119,25 @@ def border_of(places: FloatArray) -> IntArray:
     longest = LONGEST_LINK * usual_spacing(places)
     kept = {tuple(sorted(t)) for t in triangles.tolist()}
     while True:
-        uses = Counter(side for t in kept for side in combinations(t, 2))
+        uses: Counter[tuple[int, ...]] = Counter(side for t in kept for side in combinations(t, 2))
         on_border = {corner for side, n in uses.items() if n == 1 for corner in side}
         loose = []
         for triangle in kept:
-            open_sides = [side for side in combinations(triangle, 2) if uses[side] == 1]
-            (opposite,) = set(triangle) - set(open_sides[0]) if len(open_sides) == 1 else (None,)
-            if opposite is None or opposite in on_border:
-                continue
-            a, b = open_sides[0]
-            if np.linalg.norm(places[a] - places[b]) > longest:
-                loose.append((float(np.linalg.norm(places[a] - places[b])), triangle))
-        if not loose:
+            side = tuple(corner for corner in triangle if corner in on_border)
+            if len(side) == 2 and uses[side] == 1:
+                loose.append((float(np.linalg.norm(places[side[0]] - places[side[1]])), triangle))
+        length, triangle = max(loose, default=(0.0, ()))
+        if length <= longest:
             break
-        kept.remove(max(loose)[1])
+        kept.remove(triangle)
     following: dict[int, list[int]] = {}
-    for side, n in Counter(side for t in kept for side in combinations(t, 2)).items():
+    for (one, other), n in uses.items():
         if n == 1:
-            following.setdefault(side[0], []).append(side[1])
-            following.setdefault(side[1], []).append(side[0])
-    first = min(following)
-    loop, before = [first], -1
-    while True:
-        here = loop[-1]
-        step = [there for there in following[here] if there != before][0]
-        if step == first:
-            break
-        before = here
-        loop.append(step)
+            following.setdefault(one, []).append(other)
+            following.setdefault(other, []).append(one)
+    loop = [min(following)]
+    while len(loop) < len(following):
+        loop.append(next(there for there in following[loop[-1]] if there not in loop[-2:]))
     return np.array(loop)
 
 

@@ -1,6 +1,6 @@
 """The sensor's body as a solid of splines, for the mechanics.
 
-A square grid of columns is mapped to the skin (``chart``, ``shapes``). Each column passes through the skin and the gel to the lens. Shape
+A square grid of columns is mapped to the skin (``shapes``). Each column passes through the skin and the gel to the lens. Shape
 and displacement are splines in u, v and depth (isogeometric analysis: Hughes, Cottrell & Bazilevs 2005): quadratic and C1 over the dome,
 linear through the skin, and quadratic through the gel. A skin that is bent by a contact is smooth, so splines need fewer unknowns than
 trilinear elements. The displacement inside the gel is even smoother. Therefore the gel's grid below its surface has half as many lines as
@@ -8,19 +8,20 @@ the skin's grid, and is nested in it.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
+from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import BSpline
 from scipy.sparse import csr_array
 
 from scenes.sensor import GeometrySpec
 from twin.compiled import compiled
-from twin.geometry.bspline import Basis
-from twin.geometry.chart import Chart, Focus, RectangleChart
-from twin.geometry.pins import rest_pins
-from twin.geometry.shapes import shape_of
+from twin.geometry.pins import PinRest, rest_pins
+from twin.geometry.shapes import Chart, Focus, RectangleChart, shape_of
 from twin.types import BoolArray, ComplexArray, FloatArray, IntArray
 
+_legendre = cache(np.polynomial.legendre.leggauss)
 _GEL_GRADING = 1.5
 """Exponent of the gel's grading: boundary k of n elements through the gel is at the relative depth (k / n)^1.5, so elements below the skin
 are thin."""
@@ -29,6 +30,53 @@ _MOST_POLAR_ITERATIONS = 50
 _POLAR_CHANGE = 1e-9
 """Convergence threshold of the polar decomposition: the iteration ends after a smaller change. The convergence is quadratic, so the next
 change would be about its square."""
+
+
+@dataclass(frozen=True)
+class Basis:
+    """B-splines of a degree between ``breaks`` (elements + 1,).
+
+    A quadratic basis of m elements has m + 2 functions and is C1; a linear basis has m + 1 functions and is C0. At both ends a spline
+    equals its first and last coefficient (open knot vector; Piegl & Tiller, "The NURBS Book", ch. 2).
+    """
+
+    breaks: FloatArray
+    degree: int = 2
+
+    @property
+    def elements(self) -> int:
+        """Number of intervals."""
+        return len(self.breaks) - 1
+
+    @property
+    def count(self) -> int:
+        """Number of functions."""
+        return self.elements + self.degree
+
+    @property
+    def _knots(self) -> FloatArray:
+        return np.concatenate([[self.breaks[0]] * self.degree, self.breaks, [self.breaks[-1]] * self.degree])
+
+    @property
+    def greville(self) -> FloatArray:
+        """Greville points (count,): means of ``degree`` neighbouring knots. The coefficients of a linear function are its values there."""
+        knots = self._knots
+        return np.array([knots[i + 1 : i + 1 + self.degree].mean() for i in range(self.count)])
+
+    def values(self, at: FloatArray, *, derivative: int = 0) -> FloatArray:
+        """Values (k, count) of all functions, or of one of their derivatives, at points (k,)."""
+        splines = BSpline.construct_fast(self._knots, np.eye(self.count), self.degree)
+        return (splines.derivative(derivative) if derivative else splines)(np.clip(at, self.breaks[0], self.breaks[-1]))
+
+    def element_of(self, at: FloatArray) -> IntArray:
+        """Index (k,) of the element that contains each point."""
+        return np.clip(np.searchsorted(self.breaks, at, side="right") - 1, 0, self.elements - 1)
+
+    def gauss(self, points: int) -> tuple[FloatArray, FloatArray]:
+        """Gauss points and weights (elements, points) of every element."""
+        local, weights = _legendre(points)
+        half = np.diff(self.breaks)[:, None] / 2
+        return (self.breaks[1:] + self.breaks[:-1])[:, None] / 2 + half * local, half * weights
 
 
 @dataclass(frozen=True)
@@ -52,8 +100,7 @@ class Resolution:
             raise ValueError(f"a solid needs an even across >= 4, skin_layers >= 1 and gel_layers >= 1, got {self}")
 
 
-@dataclass(frozen=True)
-class Cells:
+class Cells(NamedTuple):
     """Elements of one kind.
 
     Attributes
@@ -69,11 +116,6 @@ class Cells:
     controls: IntArray
     gradients: FloatArray
     weights_mm3: FloatArray
-
-    @cached_property
-    def mean_gradients(self) -> FloatArray:
-        """Mean of the gradients over the points of each element, (m, 3, b)."""
-        return self.gradients.mean(axis=1)
 
 
 @dataclass(frozen=True)
@@ -98,10 +140,11 @@ class Solid:
         Splines along the square's sides in the skin and in the gel, and through the gel (depth 1 at the skin, 2 at the lens).
     inner : slice
         Controls of the skin's inside.
-    pin_value, pin_slope_u, pin_slope_v : (N, side^2) float
-        Matrices that map the controls of the skin's inside to the positions and derivatives of the skin's inside at the pins' feet.
-    pin_base_mm, pin_axis : (N, 3) float
-        Feet and axes of the pins at rest.
+    pin_rows : (3, N, side^2) float
+        Matrices that map the controls of the skin's inside to the positions and to the derivatives, by u and by v, of the skin's inside at
+        the pins' feet.
+    pins : PinRest
+        The pins at rest.
     pin_cap_length_mm : float
         Distance from a pin's foot to the centre of its cap.
     """
@@ -117,17 +160,14 @@ class Solid:
     coarse: Basis
     through: Basis
     inner: slice
-    pin_value: FloatArray
-    pin_slope_u: FloatArray
-    pin_slope_v: FloatArray
-    pin_base_mm: FloatArray
-    pin_axis: FloatArray
+    pin_rows: FloatArray
+    pins: PinRest
     pin_cap_length_mm: float
 
     @cached_property
     def pin_operator(self) -> csr_array:
-        """``pin_value``, ``pin_slope_u`` and ``pin_slope_v``, stacked vertically: (3 N, side^2). Each row has nine non-zero entries."""
-        return csr_array(np.concatenate([self.pin_value, self.pin_slope_u, self.pin_slope_v]))
+        """``pin_rows``, stacked vertically: (3 N, side^2). Each row has nine non-zero entries."""
+        return csr_array(np.concatenate(self.pin_rows))
 
     @cached_property
     def pin_rest(self) -> tuple[FloatArray, FloatArray]:
@@ -157,11 +197,10 @@ def build_solid(geometry: GeometrySpec, *, resolution: Resolution | None = None,
         clamped[:, [0, -1], :] = clamped[:, :, [0, -1]] = True
     fixed_coarse[-1] = True
 
-    skin_parts = [[(index[e + d], basis, _local(through_skin, e, d)) for d in (0, 1)] for e in range(layers)]
-    top = [(index[-1], basis, _local(through, 0, 0))] + [(below[d - 1], coarse, _local(through, 0, d)) for d in (1, 2)]
-    deep_parts = [[(below[e + d - 1], coarse, _local(through, e, d)) for d in range(3)] for e in range(1, resolution.gel_layers)]
+    skin_parts = [[(index[e + d], basis) for d in (0, 1)] for e in range(layers)]
+    top = [(index[-1], basis), (below[0], coarse), (below[1], coarse)]
+    deep_parts = [[(below[e + d - 1], coarse) for d in range(3)] for e in range(1, resolution.gel_layers)]
     pins = rest_pins(geometry)
-    value, slope_u, slope_v = surface_operators(basis, chart.square(shape.place(pins.base_mm)))
     return Solid(
         control_mm=control,
         fixed=np.concatenate([fixed_fine.ravel(), fixed_coarse.ravel()]),
@@ -177,11 +216,8 @@ def build_solid(geometry: GeometrySpec, *, resolution: Resolution | None = None,
         basis=basis,
         coarse=coarse,
         through=through,
-        pin_value=value,
-        pin_slope_u=slope_u,
-        pin_slope_v=slope_v,
-        pin_base_mm=pins.base_mm,
-        pin_axis=pins.axis,
+        pin_rows=np.stack(surface_operators(basis, chart.square(shape.place(pins.base_mm)))),
+        pins=pins,
         inner=slice(layers * side**2, (layers + 1) * side**2),
         pin_cap_length_mm=geometry.pins.length_mm + geometry.pins.cap_height_mm / 2,
     )
@@ -217,8 +253,8 @@ def pin_pose(solid: Solid, control_mm: FloatArray) -> tuple[FloatArray, FloatArr
     rest_foot, rest_inverse = solid.pin_rest
     foot, frame = _surface(solid, control_mm)
     turn = rotations(frame @ rest_inverse)
-    base = foot + np.einsum("kij,kj->ki", turn, solid.pin_base_mm - rest_foot)
-    axis = np.einsum("kij,kj->ki", turn, solid.pin_axis)
+    base = foot + np.einsum("kij,kj->ki", turn, solid.pins.base_mm - rest_foot)
+    axis = np.einsum("kij,kj->ki", turn, solid.pins.axis)
     return base, axis, base + solid.pin_cap_length_mm * axis
 
 
@@ -235,22 +271,16 @@ def _fit(basis: Basis, chart: Chart | RectangleChart, geometry: GeometrySpec, de
     return np.einsum("ri,cj,ijx->rcx", inverse, inverse, places.reshape(basis.count, basis.count, 3), optimize=True).reshape(-1, 3)
 
 
-def _local(through: Basis, element: int, function: int) -> tuple[FloatArray, FloatArray]:
-    """Values (2,) and slopes (2,), at an element's two Gauss points, of one of the functions that are not zero in the element."""
-    at = through.gauss(2)[0][element]
-    return through.values(at)[:, element + function], through.values(at, derivative=1)[:, element + function]
-
-
-def spline_cells(
-    grid: Basis, parts: list[tuple[IntArray, Basis, tuple[FloatArray, FloatArray]]], through: Basis, layer: int, control_mm: FloatArray
-) -> Cells:
+def spline_cells(grid: Basis, parts: list[tuple[IntArray, Basis]], through: Basis, layer: int, control_mm: FloatArray) -> Cells:
     """Elements of one layer over the intervals of ``grid``.
 
-    ``parts`` contains, for each function through the depth, its controls (side, side), their basis, and the function's values and slopes.
+    ``parts`` contains, for each function through the depth that is not zero in the layer, its controls (side, side) and their basis.
     """
     at, weights = grid.gauss(2)
+    depth, depth_weights = (each[layer] for each in through.gauss(2))
     shape_parts, control_parts = [], []
-    for index, basis, (value, slope) in parts:
+    for function, (index, basis) in enumerate(parts, layer):
+        value, slope = (through.values(depth, derivative=d)[:, function] for d in (0, 1))
         first = basis.element_of((grid.breaks[1:] + grid.breaks[:-1]) / 2)
         window = first[:, None] + np.arange(3)
         f0, f1 = (
@@ -262,7 +292,6 @@ def spline_cells(
         control_parts.append(index[window[:, None, :, None], window[None, :, None, :]].reshape(-1, 9))
     shapes, controls = np.concatenate(shape_parts, axis=3), np.concatenate(control_parts, axis=1)
     jacobian = np.einsum("mqja,mai->mqji", shapes, control_mm[controls], optimize=True).swapaxes(2, 3)
-    depth_weights = through.gauss(2)[1][layer]
     volume = np.linalg.det(jacobian) * np.einsum("d,rq,cs->rcdqs", depth_weights, weights, weights).reshape(-1, 8)
     if volume.min() <= 0:
         raise ValueError(f"{np.count_nonzero(volume.min(axis=1) <= 0)} elements are inside out at rest; check the sensor's geometry")
@@ -274,7 +303,7 @@ def joined_cells(parts: list[Cells]) -> Cells:
     """The elements of several layers in one ``Cells``. Without layers it is empty, with the array shapes of the gel (27 controls)."""
     if not parts:
         return Cells(np.zeros((0, 27), int), np.zeros((0, 8, 3, 27)), np.zeros((0, 8)))
-    return Cells(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("controls", "gradients", "weights_mm3")))
+    return Cells(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def _boxes(count: int, size: int) -> IntArray:

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.errors import ContactError
 from twin.mechanics.body.elements import Elements, KeptStiffness
 from twin.mechanics.contact import ContactForces, ContactPoints, contact_forces, positions, spread_forces
+from twin.mechanics.law import ContactLaw
 from twin.objects import ObjectField
 from twin.types import BoolArray, FloatArray, IntArray
 
@@ -50,42 +50,6 @@ class Body:
 
 
 @dataclass(frozen=True)
-class Friction:
-    """Coulomb friction with slip weakening (Ida 1972).
-
-    A point that has slid by s since it last stuck has the coefficient mu = kinetic + (static - kinetic) exp(-s / weakening_mm).
-    The shear stress never exceeds ``shear_strength_mpa``.
-
-    Attributes
-    ----------
-    static, kinetic : float
-        Coefficients of a point that sticks, and of one that has slid far.
-    weakening_mm : float
-        Distance of sliding over which the coefficient falls.
-    shear_strength_mpa : float
-        Largest shear stress.
-
-    Raises
-    ------
-    ContactError
-        Not 0 <= kinetic <= static, or ``weakening_mm`` or ``shear_strength_mpa`` is not positive.
-    """
-
-    static: float
-    kinetic: float
-    weakening_mm: float = 0.1
-    shear_strength_mpa: float = np.inf
-
-    def __post_init__(self) -> None:
-        if not (0 <= self.kinetic <= self.static < np.inf and self.weakening_mm > 0 and self.shear_strength_mpa > 0):
-            raise ContactError(f"friction needs 0 <= kinetic <= static, weakening_mm > 0 and shear_strength_mpa > 0, got {self}")
-
-    def after(self, slid_mm: FloatArray) -> FloatArray:
-        """Coefficients of friction (q,) of points that have slid by ``slid_mm`` (q,) since they last stuck."""
-        return self.kinetic + (self.static - self.kinetic) * np.exp(-slid_mm / self.weakening_mm)
-
-
-@dataclass(frozen=True)
 class LoadState:
     """State of the contact at the end of a converged load step.
 
@@ -104,7 +68,7 @@ class LoadState:
     limit_n : (p,) float
         Largest friction force that each point can bear.
     gap_mm : (p,) float
-        Distance of each point from the object, negative inside; 0 before the contact.
+        Distance of each point from the object, negative inside.
     penalty_mpa_mm : float
         Contact pressure for a unit of penetration, MPa/mm.
     T : (4, 4) float
@@ -148,8 +112,8 @@ class Balance:
         Sum of the magnitudes of the contact forces, at least ``FORCE_FLOOR_N``.
     elastic_nmm : float
         Energy stored in the body.
-    volume_force_n_per_mm3 : float
-        See ``Body``.
+    absolute : float
+        Norm of all residuals in N; the gel's change of volume is converted to a force.
     """
 
     control_mm: FloatArray
@@ -161,13 +125,7 @@ class Balance:
     point_force_n: FloatArray
     scale_n: float
     elastic_nmm: float
-    volume_force_n_per_mm3: float
-
-    @property
-    def absolute(self) -> float:
-        """Norm of all residuals in N; the gel's change of volume is converted to a force."""
-        yielding_n, volume_mm3 = self.border_residual
-        return float(np.linalg.norm([np.linalg.norm(self.residual), yielding_n, self.volume_force_n_per_mm3 * volume_mm3]))
+    absolute: float
 
     @property
     def relative(self) -> float:
@@ -188,40 +146,27 @@ class Problem:
     body : Body
     field : ObjectField
         The object that presses.
-    friction : Friction
-    compliance_mm_per_n : float
-        Displacement of the object along z per N.
+    law : ContactLaw
+        Its friction, and its displacement of the object along z per N.
     state : LoadState
         State at the start of the step, with the pose and the anchors of its end. The slip of each point determines its coefficient of
         friction.
     looked : (q,) int
         Candidate points: the contact points that the equations include. The other points are assumed to be free.
-    given : list of float arrays
-        Given viscoelastic stress of each kind of elements (see ``Elements.add_forces``).
     """
 
-    def __init__(
-        self,
-        body: Body,
-        field: ObjectField,
-        friction: Friction,
-        compliance_mm_per_n: float,
-        state: LoadState,
-        looked: IntArray,
-        given: list[FloatArray],
-    ) -> None:
-        self.body, self.compliance, self._field = body, compliance_mm_per_n, field
+    def __init__(self, body: Body, field: ObjectField, law: ContactLaw, state: LoadState, looked: IntArray) -> None:
+        self.body, self.field, self.T, self.looked = body, field, state.T, looked
+        self.compliance, self._law = law.compliance_mm_per_n, law.friction
         self.volume_force_n_per_mm3 = body.volume_force_n_per_mm3
-        self._given, self.T, self.looked = given, state.T, looked
         points = body.points
         self.controls, self.weights = points.controls[looked], points.weights[looked]
         self.lift = points.lift_mm[looked]
         self.anchor_mm = state.anchor_mm[looked]
         self.stiff = state.penalty_mpa_mm * points.area_mm2[looked]
-        self.bound_n = friction.shear_strength_mpa * points.area_mm2[looked]
-        self._law = friction
+        self.bound_n = self._law.shear_strength_mpa * points.area_mm2[looked]
         self.slid_mm = state.slid_mm[looked]
-        self.friction = friction.after(self.slid_mm)
+        self.friction = self._law.after(self.slid_mm)
 
     def move_object(self, T: FloatArray, anchor_mm: FloatArray, slid_mm: FloatArray) -> "Problem":
         """The same equations with the object at ``T`` (4, 4), and with anchors (q, 3) and slip (q,) of the candidate points."""
@@ -231,15 +176,15 @@ class Problem:
 
     def contact(self, at: FloatArray, soften: float = 1.0) -> ContactForces:
         """Contact forces with the candidate points at positions ``at`` (q, 3) in the object's frame."""
-        return contact_forces(self._field, at, self.stiff, self.anchor_mm, self.friction, bound_n=self.bound_n, soften=soften)
+        return contact_forces(self.field, at, self.stiff, self.anchor_mm, self.friction, self.bound_n, soften)
 
     def balance(self, control: FloatArray, border: FloatArray) -> Balance | None:
         """The balance at a state; None if an element is inverted (det F <= 0)."""
         body, volume = self.body, 0.0
         residual = np.zeros(control.shape)
         elastic_nmm = 0.0
-        for number, (kind, given) in enumerate(zip(body.kinds, self._given, strict=True)):
-            elastic_nmm += kind.add_forces(control, given, residual, border[1] if number else 0.0)
+        for number, kind in enumerate(body.kinds):
+            elastic_nmm += kind.add_forces(control, residual, border[1] if number else 0.0)
         if not np.isfinite(elastic_nmm):
             return None
         if body.sealed:
@@ -264,12 +209,13 @@ class Problem:
             border_residual[0] = border[0] / self.compliance + float(force[:, 2].sum())
         scale = max(float(np.linalg.norm(force, axis=1).sum()), FORCE_FLOOR_N)
         residual = elastic - pushed[self.body.free].ravel()
-        return Balance(control, border, elastic, residual, border_residual, contact, force, scale, elastic_nmm, self.volume_force_n_per_mm3)
+        absolute = float(np.linalg.norm([np.linalg.norm(residual), border_residual[0], self.volume_force_n_per_mm3 * volume_mm3]))
+        return Balance(control, border, elastic, residual, border_residual, contact, force, scale, elastic_nmm, absolute)
 
     def stiffness(self, at: Balance, kept: list[KeptStiffness], *, fresh: bool) -> None:
         """Update the elements' tangents to a state; ``fresh`` recomputes all of them."""
-        for number, (kind, given, blocks) in enumerate(zip(self.body.kinds, self._given, kept, strict=True)):
-            blocks.update(kind, at.control_mm, given, at.border[1] if number else 0.0, fresh=fresh)
+        for number, (kind, blocks) in enumerate(zip(self.body.kinds, kept, strict=True)):
+            blocks.update(kind, at.control_mm, at.border[1] if number else 0.0, fresh=fresh)
 
     def volume(self, control: FloatArray, out: FloatArray) -> float:
         """Increase of the gel's volume, mm^3; adds its gradient to ``out``."""

@@ -1,16 +1,33 @@
-"""Contact problem on the condensed body: a small dense system, solved by Newton's method."""
+"""Contact problem on the condensed body, a small dense system that is solved by Newton's method; and on it, friction in short substeps.
 
+Friction depends on the path. A point at the edge of a growing contact first bears a small pressure and slips; when the edge has passed,
+the point sticks. In one long load step it would stick from the moment it touches, and the shear forces would be up to 10 % too small.
+Therefore a load step with friction in which new places touch is computed a second time in short substeps. They use the body's tangent K,
+condensed at the end of the step. The elastic force is linear in the controls x, plus a term that makes it exact at the start of the step
+(0) as well as at its end (1):
+
+    f(x, t) = f_1 + K (x - x_1) + (1 - t) [f_0 - f_1 - K (x_0 - x_1)],    t from 0 to 1
+
+Each substep solves contact and friction exactly on this small problem. The anchors and slips after the substeps then enter the equations of
+the whole load step.
+"""
+
+from copy import copy
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 from scipy.linalg import blas, lapack
 
 from twin.compiled import compiled
-from twin.mechanics.balance import FORCE_FLOOR_N, Balance, Problem
-from twin.mechanics.body.linear import Eliminated, split_matrix
+from twin.mechanics.balance import FORCE_FLOOR_N, Balance, LoadState, Problem, in_object
+from twin.mechanics.body.linear import FrontalSolver
 from twin.mechanics.contact import ContactForces, positions, spread_forces, spread_stiffness
+from twin.mechanics.path import ContactPath
 from twin.mechanics.turns import turn_vectors, turned_back, turned_matrix
-from twin.types import FloatArray, IntArray
+from twin.types import BoolArray, FloatArray, IntArray
+
+Triple: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
 _ITERATIONS = 60
 """Largest number of Newton iterations on the small problem."""
@@ -29,33 +46,71 @@ _SOFTENING = 0.1
 _INEXACT = 0.01
 """The inner iteration ends when its residual is this share of the whole problem's residual. A smaller one does not help the outer
 iteration."""
+SUBSTEP_MM = 0.05
+"""Largest motion of the object at a contact point in one substep, mm. Substeps of half this length change the shear forces by less
+than 1 %."""
+_MOST_SUBSTEPS = 16
+"""Largest number of substeps in a load step."""
+_SUBSTEP_TOLERANCE = 5e-3
+"""Convergence threshold of a substep: norm of the residual relative to the sum of the contact forces at the end of the load step."""
+_SUBSTEP_ITERATIONS = 20
+"""Largest number of iterations of a substep; three are usual."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Tangent:
-    """The body's tangent stiffness, condensed to the kept unknowns.
+    """The body's tangent stiffness, condensed to the kept unknowns, and its rotation with the body since it was computed.
 
     Attributes
     ----------
-    eliminated : Eliminated
+    eliminated : FrontalSolver
     matrix : (k, k) float
         Condensed matrix of the kept unknowns.
-    volume_column : (unknowns,) float, optional
-        Column of the sealed gel's pressure, which is one more unknown, after elimination. None for a gel that is not sealed.
+    volume_column : (unknowns,) float
+        Column of the sealed gel's pressure, which is one more unknown, after elimination. Zero for a gel that is not sealed.
     volume_pivot : float
         Diagonal entry of that pressure after elimination.
     strains : list of float arrays
         State at which the tangent was computed (see ``Turns.strains``).
+    local : (p, 9) int
+        Index of each contact point's controls among the kept controls.
+    turns : (free, 3, 3) float, optional
+        Rotation of each free control since the tangent was computed; None for a new tangent.
     """
 
-    eliminated: Eliminated
+    eliminated: FrontalSolver
     matrix: FloatArray  # (k, k), symmetric
-    volume_column: FloatArray | None
+    volume_column: FloatArray
     volume_pivot: float
     strains: list[FloatArray]
+    local: IntArray
+    turns: FloatArray | None = None
+    _forward: tuple[FloatArray, FloatArray] | None = None
+    _near: tuple[IntArray, "Near", FloatArray | None, "Near"] | None = None
+
+    def turn(self, turns: FloatArray) -> None:
+        """Rotate the tangent with the body, by ``turns`` since it was computed."""
+        self.turns, self._forward = turns, None
+
+    def forward(self, elastic: FloatArray, volume_mm3: float) -> tuple[FloatArray, float]:
+        """Forces (unknowns,), rotated back to the state of the tangent, and a change of volume, both after forward elimination."""
+        if self._forward is None or self._forward[0] is not elastic:
+            self._forward = elastic, self.eliminated.forward(elastic if self.turns is None else turned_back(self.turns, elastic))
+        forward, inner = self._forward[1], self.eliminated.inner
+        return forward, np.float64(volume_mm3 - inner(self.volume_column) @ inner(forward))
+
+    def near(self, looked: IntArray) -> "Near":
+        """The tangent condensed to the candidate points (q,). The last result is stored."""
+        if self._near is None or not np.array_equal(self._near[0], looked):
+            still = Near(self, self.local[looked])
+            self._near = looked, still, None, still
+        _, still, turns, last = self._near
+        if self.turns is not None and turns is not self.turns:
+            last = still.turn(self.turns[self.eliminated.kept[::3] // 3], last.solved)
+            self._near = looked, still, self.turns, last
+        return last
 
 
-@dataclass
 class Near:
     """The tangent, condensed further to the controls that carry the candidate points.
 
@@ -83,33 +138,21 @@ class Near:
         Softening of the contact, and the factors and pivots of the last matrix (n + 2, n + 2) of Newton's method.
     """
 
-    near: IntArray
-    far: IntArray
-    local: IntArray
-    matrix: FloatArray
-    column: FloatArray
-    factor: FloatArray
-    coupling: FloatArray
-    far_column: FloatArray
-    turns: FloatArray | None = None
-    solved: tuple[float, FloatArray, IntArray] | None = None
-
-    @classmethod
-    def of(cls, tangent: Tangent, local: IntArray) -> "Near":
+    def __init__(self, tangent: Tangent, local: IntArray) -> None:
         matrix, count = tangent.matrix, len(tangent.matrix)
         stays = np.zeros(count // 3 + 1, bool)
         stays[local] = True
         stays = np.repeat(stays[:-1], 3)
-        far = np.flatnonzero(~stays)
-        near = np.flatnonzero(stays)
-        within, across, rest = split_matrix(matrix, far, near)
+        far, near = np.flatnonzero(~stays), np.flatnonzero(stays)
+        rows = matrix.take(near, axis=0)
+        within, across, rest = matrix.take(far, axis=0).take(far, axis=1), rows.take(far, axis=1), rows.take(near, axis=1)
         factor, info = lapack.spotrf(within.T, lower=1, clean=0, overwrite_a=1) if len(far) else (np.zeros((0, 0)), 0)
         if info > 0:  # without contact some far controls have no stiffness: eliminate none
             near, far, factor, rest = np.arange(count), far[:0], np.zeros((0, 0)), matrix
         controls = near[::3] // 3
         renumber = np.full(count // 3 + 1, len(controls))
         renumber[controls] = np.arange(len(controls))
-        column = np.zeros(count, np.float32) if tangent.volume_column is None else tangent.volume_column[tangent.eliminated.kept]
+        column = tangent.volume_column[tangent.eliminated.kept]
         column, far_column = column[near], column[far]
         coupling = np.zeros((0, len(near)), np.float32)
         if len(far):
@@ -117,12 +160,17 @@ class Near:
             far_column = lapack.strtrs(factor, far_column, lower=1)[0]
             rest = rest - coupling.T @ coupling
             column = column - coupling.T @ far_column
-        return cls(near, far, renumber[local], rest, column, factor, coupling, far_column)
+        self.near, self.far, self.local, self.matrix, self.column = near, far, renumber[local], rest, column
+        self.factor, self.coupling, self.far_column = factor, coupling, far_column
+        self.turns: FloatArray | None = None
+        self.solved: tuple[float, FloatArray, IntArray] | None = None
 
-    def turn(self, turns: FloatArray) -> "Near":
+    def turn(self, turns: FloatArray, solved: tuple[float, FloatArray, IntArray] | None) -> "Near":
         """The same for a body whose kept controls have rotated by ``turns`` (k / 3, 3, 3) since the tangent was computed."""
-        turns = turns[self.near[::3] // 3]
-        return replace(self, matrix=turned_matrix(turns, self.matrix), column=turn_vectors(turns, self.column), turns=turns)
+        other = copy(self)
+        other.turns, other.solved = turns[self.near[::3] // 3], solved
+        other.matrix, other.column = turned_matrix(other.turns, self.matrix), turn_vectors(other.turns, self.column)
+        return other
 
 
 class SmallContact:
@@ -137,9 +185,9 @@ class SmallContact:
     volume into a force (``Body.volume_force_n_per_mm3``), so that all residuals are in N and have one norm.
     """
 
-    def __init__(self, problem: Problem, near: Near, pivot: float, residual: FloatArray, volume_residual: float, balance: Balance) -> None:
-        self._problem, self._border, self._near = problem, balance.border, near
-        self.iterations = 0
+    def __init__(self, problem: Problem, tangent: Tangent, residual: FloatArray, volume_residual: float, balance: Balance) -> None:
+        self._problem, self._border, self.iterations = problem, balance.border, 0
+        near = self._near = tangent.near(problem.looked)
         self._at = positions(problem.controls, problem.weights, problem.lift, balance.control_mm)
         self._far_residual = lapack.strtrs(near.factor, residual[near.far], lower=1)[0] if len(near.far) else residual[near.far]
         self._r = residual[near.near] - near.coupling.T @ self._far_residual
@@ -147,7 +195,7 @@ class SmallContact:
             self._r = turn_vectors(near.turns, self._r)
         self._v = near.column
         self._g = volume_residual - near.far_column @ self._far_residual
-        self._q = pivot - near.far_column @ near.far_column
+        self._q = tangent.volume_pivot - near.far_column @ near.far_column
 
     def solve(self, balance: Balance, *, soften: bool, least: float) -> tuple[FloatArray, FloatArray]:
         """Displacements of all kept unknowns (k,), rotated back to the state of the tangent, and changes of the border unknowns (2,).
@@ -157,10 +205,10 @@ class SmallContact:
         """
         wanted = max(_INEXACT * (FORCE_FLOOR_N if soften else balance.absolute), least * balance.scale_n)
         start = np.zeros(len(self._near.near) + 2)
-        y, done = (start, False) if soften else self._newton(start, 1.0, wanted, _HASTY_ITERATIONS)
+        y, done = (start, False) if soften else self.newton(start, wanted, _HASTY_ITERATIONS)
         if not done:
-            y, _ = self._newton(start, _SOFTENING, wanted, _ITERATIONS)
-            y, _ = self._newton(y, 1.0, wanted, _ITERATIONS)
+            y, _ = self.newton(start, wanted, _ITERATIONS, _SOFTENING)
+            y, _ = self.newton(y, wanted, _ITERATIONS)
         near = self._near
         out = np.zeros(len(near.near) + len(near.far))
         moved = y[:-2] if near.turns is None else turned_back(near.turns, y[:-2])
@@ -170,22 +218,15 @@ class SmallContact:
             out[near.far] = -lapack.strtrs(near.factor, right, lower=1, trans=1)[0]
         return out, y[-2:]
 
-    def newton(self, y: FloatArray, wanted: float, most: int) -> tuple[FloatArray, bool]:
-        """Solve from a start (n + 2,), in at most ``most`` iterations.
-
-        Returns the displacements of the near controls and the border, and whether the residual (N) is at most ``wanted``.
-        """
-        return self._newton(y, 1.0, wanted, most)
-
-    def contact(self, y: FloatArray) -> ContactForces:
-        """Contact forces after displacements ``y`` (n + 2,)."""
-        return self._problem.contact(self.places(y))
-
     def places(self, y: FloatArray) -> FloatArray:
         """Candidate points (q, 3) after displacements ``y`` (n + 2,), in the object's frame."""
         return _move_points(self._near.local, self._problem.weights, self._at, y, self._problem.T, self._border[0] + y[-2])
 
-    def _newton(self, y: FloatArray, soften: float, wanted: float, most: int) -> tuple[FloatArray, bool]:
+    def newton(self, y: FloatArray, wanted: float, most: int, soften: float = 1.0) -> tuple[FloatArray, bool]:
+        """Solve the problem with softened contact from a start (n + 2,), in at most ``most`` iterations.
+
+        Returns the displacements of the near controls and the border, and whether the residual (N) is at most ``wanted``.
+        """
         residual, contact = self._equations(y, soften)
         norm = float(np.linalg.norm(residual))
         for _ in range(most):
@@ -219,15 +260,12 @@ class SmallContact:
 
     def _equations(self, y: FloatArray, soften: float) -> tuple[FloatArray, ContactForces]:
         problem, near = self._problem, self._near
-        border = self._border + y[-2:]
-        at = _move_points(near.local, problem.weights, self._at, y, problem.T, border[0])
-        contact = problem.contact(at, soften)
-        out = np.zeros(len(y))
-        force_z = _residual(near.matrix, y, self._r, self._v, near.local, problem.weights, contact.force_n, problem.T, out)
+        contact, out = problem.contact(self.places(y), soften), np.zeros(len(y))
+        carried = near.local, problem.weights, contact.force_n
+        force_z = _residual((near.matrix, self._v, self._r), y, carried, problem.T, out)
         if problem.compliance:
-            out[-2] = border[0] / problem.compliance + force_z
-        if problem.body.sealed:
-            out[-1] = problem.volume_force_n_per_mm3 * (self._g + self._v @ y[:-2] + self._q * y[-1])
+            out[-2] = (self._border[0] + y[-2]) / problem.compliance + force_z
+        out[-1] = problem.volume_force_n_per_mm3 * (self._g + self._v @ y[:-2] + self._q * y[-1])
         return out, contact
 
     def _factorise(self, contact: ContactForces, soften: float) -> None:
@@ -259,6 +297,119 @@ class SmallContact:
         return lapack.sgetrs(factors, pivots, right_side.astype(np.float32))[0].astype(float)
 
 
+def substeps(moved_mm: float) -> int:
+    """Number of substeps of a load step in which the object moves by ``moved_mm`` at a contact point."""
+    return min(int(np.ceil(moved_mm / SUBSTEP_MM)), _MOST_SUBSTEPS)
+
+
+def friction_substeps(
+    problem: Problem, state: LoadState, anchor_mm: FloatArray, tangent: Tangent, balance: Balance, count: int
+) -> LoadState | None:
+    """The history of friction up to the last substep of a load step, and the anchors for the last substep.
+
+    Parameters
+    ----------
+    problem : Problem
+        Equations of the load step.
+    state : LoadState
+        State at the start of the load step.
+    anchor_mm : (p, 3) float
+        Anchors of all contact points. Those of the candidate points are replaced in the result.
+    tangent : Tangent
+        The body's tangent, near the end of the load step.
+    balance : Balance
+        State at the end of the load step, at least approximately solved.
+    count : int
+        Number of substeps.
+
+    Returns
+    -------
+    LoadState
+        The state at the start, except for ``held``, ``slid_mm``, ``limit_n`` and ``gap_mm``, which are those one substep before the end,
+        ``dissipated_nmm`` up to there, and ``T`` and ``anchor_mm`` of the last substep. None if a substep did not converge.
+    """
+    looked, kept, field = problem.looked, tangent.eliminated.kept, problem.field
+    near, turns = tangent.near(looked), tangent.turns
+    forward, volume = tangent.forward(balance.elastic, balance.border_residual[1])
+    start: FloatArray = (state.control_mm - balance.control_mm)[problem.body.free].ravel()[kept]
+    y = np.concatenate([start[near.near], state.border - balance.border])
+    if turns is not None:
+        turns = turns[kept[::3] // 3]
+        start = turned_back(turns, start)
+    start = start.astype(np.float32)
+    at_start = in_object(positions(problem.controls, problem.weights, problem.lift, state.control_mm), state.T, state.border)
+    held = state.held[looked]
+    pressed = problem.move_object(state.T, state.anchor_mm[looked], state.slid_mm[looked]).contact(at_start).force_n @ state.T[:3, :3].T
+    spread = np.zeros((len(kept) // 3 + 1, 3))
+    spread_forces(tangent.local[looked], problem.weights, pressed * held[:, None], spread)
+    residual_start = (spread[:-1].ravel() if turns is None else turned_back(turns, spread[:-1].ravel())) - tangent.matrix @ start
+    column, pressure = tangent.volume_column[kept], state.border[1] - balance.border[1]
+    residual_start -= column * pressure
+    volume_start = -float(column @ start + tangent.volume_pivot * pressure)
+
+    way = ContactPath(np.stack([state.T, problem.T]))
+    anchor, slid, limit, lost = state.anchor_mm[looked], state.slid_mm[looked], state.limit_n[looked], 0.0
+    wanted, before, gap_before = _SUBSTEP_TOLERANCE * balance.scale_n, at_start, field.distance(at_start)
+    for number in range(1, count + 1):
+        share, predicted = number / count, y * (1 - 1 / (count + 1 - number))
+        T = way.at(share)
+        substep = problem.move_object(T, anchor, slid)
+        residual_now, volume_now = (1 - share) * residual_start + share * forward[kept], (1 - share) * volume_start + share * volume
+        small = SmallContact(substep, tangent, residual_now, volume_now, balance)
+        after = small.places(predicted)
+        substep.anchor_mm = anchor = first_touch(held, anchor, before, after, gap_before, field.distance(after))
+        if number == count:
+            break
+        y, done = small.newton(predicted, wanted, _SUBSTEP_ITERATIONS)
+        if not done:
+            near.solved = None
+            return None
+        before = small.places(y)
+        contact = substep.contact(before)
+        held, gap, gap_before = contact.penetration_mm > 0, gap_before, field.distance(before)
+        anchor, slid, limit, more = update_friction(substep, contact, limit, gap, gap_before)
+        lost += more
+    anchors, all_held, all_slid, all_limit = anchor_mm.copy(), state.held.copy(), state.slid_mm.copy(), state.limit_n.copy()
+    gap = state.gap_mm.copy()
+    anchors[looked], all_held[looked], all_slid[looked], all_limit[looked], gap[looked] = anchor, held, slid, limit, gap_before
+    history = replace(state, held=all_held, slid_mm=all_slid, limit_n=all_limit, gap_mm=gap, dissipated_nmm=lost)
+    return replace(history, T=problem.T, anchor_mm=anchors)
+
+
+def first_touch(
+    held: BoolArray, anchor: FloatArray, before: FloatArray, after: FloatArray, gap_before: FloatArray, gap: FloatArray
+) -> FloatArray:
+    """Anchors (q, 3) for a step. A point in contact keeps its anchor. A point that enters the object is anchored at its place of entry.
+
+    ``before`` and ``after`` (q, 3) are the points in the object's frame; between them each point moves on a straight line. ``gap_before``
+    and ``gap`` (q,) are the points' distances from the object at both ends.
+    """
+    driven = (gap_before > 0) & (gap < 0)
+    share = np.where(driven, gap_before / np.where(driven, gap_before - gap, 1.0), 0.0)[:, None]
+    return np.where(held[:, None], anchor, (1 - share) * before + share * after)
+
+
+def update_friction(
+    problem: Problem, contact: ContactForces, limit_n: FloatArray, gap_before: FloatArray, gap: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Friction after a step: anchors (q, 3), slip since each point last stuck (q,), limits of friction (q,) in N, dissipated work in N mm.
+
+    The friction force of a slipping point equals its limit. During the step the limit changes from ``limit_n`` (q,) to its new value, with
+    the point's normal force and slip. A point that slipped and leaves the object bears friction until its distance, which goes from
+    ``gap_before`` (q,) to ``gap`` (q,), reaches 0.
+    """
+    limit = np.minimum(problem.friction * contact.normal_n, problem.bound_n)
+    way = contact.anchor_mm - problem.anchor_mm
+    moved = np.linalg.norm(way, axis=1)
+    slid = np.where(contact.slipping, problem.slid_mm + moved, 0.0)
+    lost = float(((limit_n + limit) / 2 * moved)[contact.slipping].sum())
+    left = np.flatnonzero((gap >= 0) & (gap_before < 0) & (problem.slid_mm > 0))
+    across = way[left] - (way[left] * contact.normal[left]).sum(axis=1, keepdims=True) * contact.normal[left]
+    share = gap_before[left] / (gap_before[left] - gap[left])
+    lost += float((limit_n[left] / 2 * share * np.linalg.norm(across, axis=1)).sum())
+    return contact.anchor_mm, slid, limit, lost
+
+
 @compiled()
 def _move_points(local: IntArray, weights: FloatArray, at: FloatArray, y: FloatArray, T: FloatArray, yielded: float) -> FloatArray:
     """Points (q, 3) in the object's frame after displacements ``y`` of their controls."""
@@ -279,18 +430,13 @@ def _move_points(local: IntArray, weights: FloatArray, at: FloatArray, y: FloatA
 
 
 @compiled(fastmath=True)
-def _residual(
-    matrix: FloatArray,
-    y: FloatArray,
-    start: FloatArray,
-    column: FloatArray,
-    local: IntArray,
-    weights: FloatArray,
-    force: FloatArray,
-    T: FloatArray,
-    out: FloatArray,
-) -> float:
-    """Write the residual forces on the near controls into ``out``; returns the sum of the contact forces along z. Sensor frame."""
+def _residual(linear: Triple, y: FloatArray, carried: tuple[IntArray, FloatArray, FloatArray], T: FloatArray, out: FloatArray) -> float:
+    """Write the residual forces on the near controls into ``out``; returns the sum of the contact forces along z. Sensor frame.
+
+    ``linear``: the forces' derivatives by the controls and by the pressure, and the forces at the start; ``carried``: the points' controls
+    and weights, and the contact forces in the object's frame.
+    """
+    (matrix, column, start), (local, weights, force) = linear, carried
     count = len(y) - 2
     for r in range(count):
         total = start[r] + column[r] * y[count + 1]

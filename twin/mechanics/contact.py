@@ -20,6 +20,7 @@ from twin.compiled import compiled
 from twin.geometry.shapes import SkinShape
 from twin.geometry.solid import Solid
 from twin.objects import ObjectField
+from twin.objects.level_set import Probe
 from twin.types import BoolArray, ComplexArray, FloatArray, IntArray
 
 SMOOTH_GAP_MM = 0.006
@@ -147,53 +148,33 @@ class ContactForces:
 
 
 def contact_forces(
-    field: ObjectField,
-    at_mm: FloatArray,
-    stiff: FloatArray,
-    anchor_mm: FloatArray,
-    friction: FloatArray,
-    *,
-    bound_n: FloatArray | None = None,
-    soften: float = 1.0,
+    field: ObjectField, at: FloatArray, stiff: FloatArray, anchor: FloatArray, friction: FloatArray, bound: FloatArray, soften: float = 1.0
 ) -> ContactForces:
-    """Contact forces and their stiffness with the contact points at ``at_mm`` (p, 3), object frame.
+    """Contact forces and their stiffness with the contact points at ``at`` (p, 3) in mm, object frame.
 
     Parameters
     ----------
     stiff : (p,) float
         Penalty times area, N/mm.
-    anchor_mm : (p, 3) float
-        Friction anchor of each point.
+    anchor : (p, 3) float
+        Friction anchor of each point, mm.
     friction : (p,) float
         Coefficient of friction at each point.
-    bound_n : (p,) float, optional
+    bound : (p,) float
         Largest friction force of each point (tau A).
     soften : float
         A value below 1 gives softened contact, as an intermediate problem on the way to the solution. The penalty is multiplied by it,
         ``SMOOTH_GAP_MM`` and ``STICK_CREEP_MM`` are divided by it.
     """
-    distance, normal, hessian = field.probe(at_mm)
-    scales = SMOOTH_GAP_MM / soften, STICK_CREEP_MM / soften
-    bound = np.full(len(at_mm), np.inf) if bound_n is None else bound_n
-    force, normal_n, depth, slipping, stiffness, anchors = _law(
-        at_mm, distance, normal, hessian, soften * stiff, anchor_mm, friction, bound, *scales
-    )
-    return ContactForces(normal, force, normal_n, depth, slipping, stiffness, anchors)
+    probe = field.probe(at)
+    return ContactForces(probe[1], *_law(at, probe, soften * stiff, anchor, friction, bound, soften))
 
 
 @compiled()
 def _law(
-    at: FloatArray,
-    distance: FloatArray,
-    normal: FloatArray,
-    hessian: FloatArray,
-    stiff: FloatArray,
-    anchor: FloatArray,
-    friction: FloatArray,
-    bound: FloatArray,
-    eps: float,
-    delta: float,
+    at: FloatArray, probe: Probe, stiff: FloatArray, anchor: FloatArray, friction: FloatArray, bound: FloatArray, soften: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, FloatArray, FloatArray]:
+    (distance, normal, hessian), eps, delta = probe, SMOOTH_GAP_MM / soften, STICK_CREEP_MM / soften
     count = len(at)
     force, k = np.zeros((count, 3)), np.zeros((count, 3, 3))
     pressing, depth = np.zeros(count), np.zeros(count)

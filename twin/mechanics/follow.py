@@ -8,9 +8,8 @@ import numpy as np
 from scenes.object import ObjectSpec
 from twin.errors import ContactError
 from twin.mechanics.law import ContactLaw
-from twin.mechanics.ongoing import OngoingContact
 from twin.mechanics.path import ContactPath, carry_points, deepest_mm
-from twin.mechanics.solver import SkinSolver
+from twin.mechanics.solver import OngoingContact, SkinSolver
 from twin.objects import build_field
 from twin.types import ContactState
 
@@ -39,13 +38,12 @@ class Follower:
     touched : ObjectSpec
     law : ContactLaw
         Friction and compliance. For a sensor on an arm, ``twin.rig.contact.contact_law`` makes it.
-    step_mm : float, optional
-        Largest motion of the object at the pressed skin in one load step. The default is ``STEP_MM``, or less for an object with wires.
     """
 
-    def __init__(self, solver: SkinSolver, obj: ObjectSpec, law: ContactLaw, *, step_mm: float | None = None) -> None:
-        self._solver, self._law, self._step_mm = solver, law, step_mm or _step_of(obj)
-        self._field = build_field(obj)
+    def __init__(self, solver: SkinSolver, obj: ObjectSpec, law: ContactLaw) -> None:
+        self._solver, self._law, self._field = solver, law, build_field(obj)
+        # with wires, a longer step would move skin past the middle of a wire, where it would catch
+        self._step_mm = STEP_MM if obj.texture is None else STEP_MM * min(1.0, obj.texture.wire_diameter_mm)
         self._skin_mm = solver.shape.outside(solver.shape.even(_PLACES))
         self._rest = solver.rest()
         self._contact: OngoingContact | None = None
@@ -65,7 +63,7 @@ class Follower:
         gap = self.gap_mm(T)
         if gap >= 0:
             self._contact, self._state = None, replace(self._rest, T_sensor_object=T)
-        elif self._T is None or not np.array_equal(T, self._T) or self._relaxes:
+        elif self._T is None or not np.array_equal(T, self._T) or self._solver.relaxes:
             try:
                 self._press(T, time_s)
             except ContactError:
@@ -95,10 +93,6 @@ class Follower:
     def pressed_mm(self, T: np.ndarray) -> np.ndarray:
         """Points (k, 3) of the undeformed skin that lie inside the object at ``T``."""
         return self._skin_mm[self._gaps(T) < 0]
-
-    @property
-    def _relaxes(self) -> bool:
-        return bool(self._solver.spec.skin.relaxation or self._solver.spec.gel.relaxation)
 
     def _gaps(self, T: np.ndarray) -> np.ndarray:
         return self._field.distance((self._skin_mm - T[:3, 3]) @ T[:3, :3])
@@ -153,8 +147,3 @@ class Follower:
             for _, state in contact.advance(way.at, 0.0, 1.0, lambda progress: 0.0, _WHERE):
                 self._state = state
         raise ContactError("the arm gives way without an end under the contact's force; use less turn_compliance_deg_per_n or indentation")
-
-
-def _step_of(obj: ObjectSpec) -> float:
-    """Largest motion in one load step, mm. With wires, a longer step would move skin past the middle of a wire, where it would catch."""
-    return STEP_MM * min(1.0, obj.texture.wire_diameter_mm) if obj.texture is not None else STEP_MM

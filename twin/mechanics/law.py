@@ -6,9 +6,45 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scenes.object import ObjectSpec
-from twin.mechanics.balance import Friction
+from twin.errors import ContactError
+from twin.types import FloatArray
 
-FRICTIONLESS = Friction(0.0, 0.0)
+
+@dataclass(frozen=True)
+class Friction:
+    """Coulomb friction with slip weakening (Ida 1972).
+
+    A point that has slid by s since it last stuck has the coefficient mu = kinetic + (static - kinetic) exp(-s / weakening_mm).
+    The shear stress never exceeds ``shear_strength_mpa``.
+
+    Attributes
+    ----------
+    static, kinetic : float
+        Coefficients of a point that sticks, and of one that has slid far.
+    weakening_mm : float
+        Distance of sliding over which the coefficient falls.
+    shear_strength_mpa : float
+        Largest shear stress.
+
+    Raises
+    ------
+    ContactError
+        Not 0 <= kinetic <= static, or ``weakening_mm`` or ``shear_strength_mpa`` is not positive.
+    """
+
+    static: float
+    kinetic: float
+    weakening_mm: float = 0.1
+    shear_strength_mpa: float = np.inf
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.kinetic <= self.static < np.inf and self.weakening_mm > 0 and self.shear_strength_mpa > 0):
+            raise ContactError(f"friction needs 0 <= kinetic <= static, weakening_mm > 0 and shear_strength_mpa > 0, got {self}")
+
+    def after(self, slid_mm: FloatArray) -> FloatArray:
+        """Coefficients of friction (q,) of points that have slid by ``slid_mm`` (q,) since they last stuck."""
+        return self.kinetic + (self.static - self.kinetic) * np.exp(-slid_mm / self.weakening_mm)
+
 
 GivenWay = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """Function that takes the commanded ``T_sensor_object`` (4, 4) and the force on the object (3,) in N, sensor frame, and returns the reached
@@ -28,7 +64,7 @@ class ContactLaw:
         Any other effect of the contact force on the object's pose (see ``GivenWay``).
     """
 
-    friction: Friction = FRICTIONLESS
+    friction: Friction = Friction(0.0, 0.0)
     compliance_mm_per_n: float = 0.0
     given_way: GivenWay | None = None
 

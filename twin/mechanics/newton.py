@@ -11,14 +11,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from twin.mechanics.balance import Balance, Body, Friction, LoadState, Problem, in_object
-from twin.mechanics.body.elements import KeptStiffness
+from twin.mechanics.balance import Balance, Body, LoadState, Problem, in_object
+from twin.mechanics.body.elements import Elements, KeptStiffness
 from twin.mechanics.body.linear import FrontalSolver, NotPositiveDefinite, whole
-from twin.mechanics.condensed import LARGEST_MOVE_MM, Near, SmallContact, Tangent
-from twin.mechanics.contact import touching_mm2
-from twin.mechanics.friction_history import first_touch, friction_substeps, substeps, update_friction
+from twin.mechanics.condensed import LARGEST_MOVE_MM, SmallContact, Tangent, first_touch, friction_substeps, substeps, update_friction
+from twin.mechanics.law import ContactLaw
 from twin.mechanics.path import carry_points
-from twin.mechanics.turns import Turns, turn_vectors, turned_back
+from twin.mechanics.turns import Turns, turn_vectors
 from twin.objects import ObjectField
 from twin.types import BoolArray, FloatArray, IntArray
 
@@ -109,73 +108,64 @@ class LoadStepper:
     boxes : list of (m, 4) int
         Place of each element in the grid, for each kind of elements (see ``FrontalSolver``).
     field : ObjectField
-    friction : Friction
-    compliance_mm_per_n : float
+    law : ContactLaw
     """
 
-    def __init__(self, body: Body, boxes: list[IntArray], field: ObjectField, friction: Friction, compliance_mm_per_n: float) -> None:
-        self._body, self._boxes, self._field, self._friction = body, boxes, field, friction
-        self._compliance = compliance_mm_per_n
+    def __init__(self, body: Body, boxes: list[IntArray], field: ObjectField, law: ContactLaw) -> None:
+        self._body, self._boxes, self._field, self._law = body, boxes, field, law
         self._stiffness = [KeptStiffness(kind, _GEL_STRAIN if number else _SKIN_STRAIN) for number, kind in enumerate(body.kinds)]
         self._frontal: FrontalSolver | None = None
         self._kept: BoolArray = np.zeros(len(body.free), bool)
         self._local: IntArray = np.zeros((0, 9), int)
         self._tangent: Tangent | None = None
         self._shift = 0.0
-        self._near: tuple[Tangent, IntArray, Near] | None = None
         self._turns = Turns(body)
-        self._turned: FloatArray | None = None  # rotation of each free control since the tangent was computed; None for a new tangent
-        self._near_turned: tuple[FloatArray, Near] | None = None
-        self._forward: tuple[FloatArray, Tangent, FloatArray | None, FloatArray] | None = None
-        self._touch: tuple[FloatArray, FloatArray, FloatArray] | None = None
         self._last: LoadState | None = None
         self.iterations, self.inner_iterations, self.eliminations = 0, 0, 0
 
-    def follow(self, body: Body) -> None:
-        """Continue with changed elements: the law of a viscoelastic material is scaled by a factor that depends on the step's duration."""
-        self._body = body
-
-    def step(self, state: LoadState, T: FloatArray, given: list[FloatArray]) -> tuple[LoadState, Balance, IntArray]:
+    def step(self, state: LoadState, T: FloatArray, kinds: tuple[Elements, ...]) -> tuple[LoadState, Balance, IntArray]:
         """The converged state with the object at ``T`` (4, 4); no contact point penetrates by more than ``GAP_BOUND_MM``.
 
-        ``given`` is the viscoelastic stress from the past, for each kind of elements (see ``Elements.add_forces``).
+        ``kinds`` are the body's elements: those of a viscoelastic material depend on its past and on the step's duration.
         The method also returns the balance of the equations at that state, and the indices (q,) int of the contact points in them.
 
         Raises
         ------
         NoConvergence
         """
+        self._body = replace(self._body, kinds=kinds)
         control, border = self._extrapolate(state, T)
-        before, gap_before = self._gaps(state)
+        before = self._points_in_object_frame(state.control_mm, state.border, state.T)
         after = self._points_in_object_frame(control, border, T)
         gap = self._field.distance(after)
         looked = np.flatnonzero((gap < _REACH_MM) | state.held)
         self._provide(looked, gap)
-        anchors = first_touch(state.held, state.anchor_mm, before, after, gap_before, gap)
+        anchors = first_touch(state.held, state.anchor_mm, before, after, state.gap_mm, gap)
         memory = replace(state, T=T, anchor_mm=anchors, dissipated_nmm=0.0)
 
-        def problem_now() -> Problem:
-            return Problem(self._body, self._field, self._friction, self._compliance, memory, looked, given)
-
         known = control is not state.control_mm
-        touched = state.held | ((gap_before > 0) & (gap < 0))
-        count = substeps(self._moved_mm(state, T, touched)) if self._friction.static and (touched & ~state.held).any() else 1
+        touched, count = state.held | ((state.gap_mm > 0) & (gap < 0)), 1
+        if self._law.friction.static and (touched & ~state.held).any():
+            moved = carry_points(self._body.points.positions(state.control_mm)[touched], state.T, T)
+            count = substeps(float(np.linalg.norm(moved, axis=1).max(initial=0.0)))
         balance: Balance | None = None
         if count > 1:
-            problem = problem_now()
+            problem = Problem(self._body, self._field, self._law, memory, looked)
             balance = self._solve(problem, problem.balance(control, border), known, tolerance=_ROUGH_TOLERANCE)
             known = True
             gap_now = self._field.distance(self._points_in_object_frame(balance.control_mm, balance.border, T))
             looked = np.flatnonzero((gap_now < _SOLVED_REACH_MM) | state.held)
             self._provide(looked, gap_now)
-            problem = problem_now()
+            problem = Problem(self._body, self._field, self._law, memory, looked)
             balance = problem.again(balance)
-            memory = self._update_friction(problem, state, anchors, balance, count) or memory
+            if self._tangent is None:
+                self._tangent = self._linearise(problem, balance, 0.0)
+            self._turn(self._tangent, balance.control_mm)
+            memory = friction_substeps(problem, state, anchors, self._tangent, balance, count) or memory
         for _ in range(_PENALTY_RAISES):
-            problem = problem_now()
+            problem = Problem(self._body, self._field, self._law, memory, looked)
             balance = self._solve(problem, problem.again(balance) if balance else problem.balance(control, border), known)
-            seen = self._points_in_object_frame(balance.control_mm, balance.border, T)
-            gap_seen = self._field.distance(seen)
+            gap_seen = self._field.distance(self._points_in_object_frame(balance.control_mm, balance.border, T))
             missed = gap_seen < 0
             missed[looked] = False
             if missed.any():
@@ -184,20 +174,9 @@ class LoadStepper:
             elif balance.contact.penetration_mm.max(initial=0.0) > GAP_BOUND_MM:
                 memory = replace(memory, penalty_mpa_mm=_PENALTY_GROWTH * memory.penalty_mpa_mm)
             else:
-                self._last, self._touch = state, (balance.control_mm, seen, gap_seen)
+                self._last = state
                 return self._accept_step(memory, problem, balance, gap_seen), balance, looked
         raise NoConvergence(balance.relative if balance else np.inf)
-
-    def touching_mm2(self, state: LoadState) -> float:
-        """Rest area of the skin that touches the object in a state (see ``contact.touching_mm2``)."""
-        return touching_mm2(self._body.points, self._gaps(state)[1])
-
-    def _gaps(self, state: LoadState) -> tuple[FloatArray, FloatArray]:
-        """All contact points in the object's frame, (p, 3), and their distances from the object, (p,). The last result is stored."""
-        if self._touch is not None and self._touch[0] is state.control_mm:
-            return self._touch[1:]
-        seen = self._points_in_object_frame(state.control_mm, state.border, state.T)
-        return seen, self._field.distance(seen)
 
     def _provide(self, looked: IntArray, gap: FloatArray) -> None:
         """Prepare the elimination for contact at the candidate points (q,); ``gap`` (p,) in mm are the distances of all points."""
@@ -212,19 +191,16 @@ class LoadStepper:
         self._kept = kept & free
         self._frontal = FrontalSolver([kind.cells.controls for kind in self._body.kinds], self._boxes, ~free, self._kept)
         self._local = np.where(self._kept, np.cumsum(self._kept) - 1, -1)[controls]
-        self._tangent = self._near = None
+        self._tangent = None
 
     def _extrapolate(self, state: LoadState, T: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Initial guess of controls and border: an extrapolation of the last step, or the present state if the direction of motion changed.
 
         If the extrapolation turns an element inside out, the load step does not converge. A shorter step then extrapolates less far.
         """
-        if self._last is None or not self._last.held.any():  # the first contact does not grow in proportion to the motion
-            return state.control_mm, state.border
         old, at = self._last, self._body.points.positions(state.control_mm)[state.held]
-        if not len(at):
+        if old is None or not old.held.any() or not len(at):  # the first contact does not grow in proportion to the motion
             return state.control_mm, state.border
-
         before, now = carry_points(at, old.T, state.T).ravel(), carry_points(at, state.T, T).ravel()
         ratio = (before @ now) / max(float(before @ before), 1e-300)
         if before @ now < 0.95 * np.linalg.norm(before) * np.linalg.norm(now) or ratio > 2:
@@ -241,45 +217,15 @@ class LoadStepper:
         held[looked] = contact.penetration_mm > 0
         before = state.gap_mm[looked]
         anchor[looked], slid[looked], limit[looked], lost = update_friction(problem, contact, state.limit_n[looked], before, gap[looked])
-        ended = LoadState(balance.control_mm, balance.border, anchor, held, slid, limit, gap, state.penalty_mpa_mm, problem.T)
-        return replace(ended, elastic_nmm=balance.elastic_nmm, dissipated_nmm=state.dissipated_nmm + lost)
-
-    def _moved_mm(self, state: LoadState, T: FloatArray, which: BoolArray) -> float:
-        """Largest displacement, mm, of the object at the selected contact points (``which``, (p,) bool) in a step to ``T`` (4, 4)."""
-        at = self._body.points.positions(state.control_mm)[which]
-        return float(np.linalg.norm(carry_points(at, state.T, T), axis=1).max(initial=0.0))
-
-    def _update_friction(self, problem: Problem, state: LoadState, anchors: FloatArray, balance: Balance, count: int) -> LoadState | None:
-        """The history of friction within the step (see ``rubbing.rubbed``)."""
-        if self._tangent is None:
-            self._tangent = self._linearise(problem, balance, 0.0)
-        self._turn(self._tangent, balance.control_mm)
-        near, local = self._nearest(problem, self._tangent), self._local[problem.looked]
-        forward = self._eliminate(self._tangent, balance.elastic)
-        return friction_substeps(
-            problem, state, anchors, self._field, near, self._tangent, self._turned, forward, local, balance, count=count
-        )
-
-    def _nearest(self, problem: Problem, tangent: Tangent) -> Near:
-        """The tangent condensed to the candidate points. The last result is stored."""
-        if self._near is None or self._near[0] is not tangent or not np.array_equal(self._near[1], problem.looked):
-            self._near = tangent, problem.looked, Near.of(tangent, self._local[problem.looked])
-            self._near_turned = None
-        if self._turned is None:
-            return self._near[2]
-        if self._near_turned is None or self._near_turned[0] is not self._turned:
-            last = self._near_turned[1] if self._near_turned else self._near[2]
-            near = self._near[2].turn(self._turned[tangent.eliminated.kept[::3] // 3])
-            near.solved = last.solved
-            self._near_turned = self._turned, near
-        return self._near_turned[1]
+        energies = balance.elastic_nmm, state.dissipated_nmm + lost
+        return LoadState(balance.control_mm, balance.border, anchor, held, slid, limit, gap, state.penalty_mpa_mm, problem.T, *energies)
 
     def _turn(self, tangent: Tangent, control: FloatArray) -> bool:
         """Rotate the tangent with the body to the state ``control``; True if the rotation changed."""
         turns = self._turns.since(tangent.strains, control)
-        if np.abs(turns - (np.eye(3) if self._turned is None else self._turned)).max() <= _LEAST_TURN:
+        if np.abs(turns - (np.eye(3) if tangent.turns is None else tangent.turns)).max() <= _LEAST_TURN:
             return False
-        self._turned = turns
+        tangent.turn(turns)
         return True
 
     def _points_in_object_frame(self, control: FloatArray, border: FloatArray, T: FloatArray) -> FloatArray:
@@ -333,35 +279,26 @@ class LoadStepper:
 
     def _linearise(self, problem: Problem, at: Balance, shift: float) -> Tangent:
         """The body's tangent at a state, with a shift added to its diagonal."""
-        assert self._frontal is not None, "provide first"
+        frontal = self._frontal
+        assert frontal is not None, "provide first"
         self.eliminations += 1
-        self._tangent = self._turned = None  # the elimination below overwrites their memory
+        self._tangent = None  # the elimination below overwrites its memory
         problem.stiffness(at, self._stiffness, fresh=shift > 0)
         blocks = [kept.blocks for kept in self._stiffness]
         while True:
             try:
-                eliminated = self._frontal.eliminate(blocks, shift=shift)
+                matrix = frontal.eliminate(blocks, shift=shift)
                 break
             except NotPositiveDefinite:
                 shift = max(_SHIFT_GROWTH * shift, _SMALLEST_SHIFT_N_MM)
                 if shift > _LARGEST_SHIFT_N_MM:
                     raise NoConvergence(np.inf) from None
-        matrix, strains = whole(eliminated.matrix, shift), self._turns.strains(at.control_mm)
-        if not self._body.sealed:
-            return Tangent(eliminated, matrix, None, 0.0, strains)
         column = np.zeros_like(at.control_mm)
-        problem.volume(at.control_mm, column)
-        column = eliminated.forward(column[self._body.free].ravel())
-        inner = eliminated.inner(column)
-        return Tangent(eliminated, matrix, column, -float(inner @ inner), strains)
-
-    def _eliminate(self, tangent: Tangent, elastic: FloatArray) -> FloatArray:
-        """Elastic force (unknowns,), rotated back to the state of the tangent, after forward elimination. The last result is stored."""
-        kept, turns = self._forward, self._turned
-        if kept is None or kept[0] is not elastic or kept[1] is not tangent or kept[2] is not turns:
-            forward = tangent.eliminated.forward(elastic if turns is None else turned_back(turns, elastic))
-            self._forward = kept = elastic, tangent, turns, forward
-        return kept[3]
+        if self._body.sealed:
+            problem.volume(at.control_mm, column)
+        column = frontal.forward(column[self._body.free].ravel())
+        inner, strains = frontal.inner(column), self._turns.strains(at.control_mm)
+        return Tangent(frontal, whole(matrix, shift), column, -float(inner @ inner), strains, self._local)
 
     def _contact_move(
         self, problem: Problem, tangent: Tangent, balance: Balance, elastic: FloatArray, soften: bool
@@ -369,14 +306,9 @@ class LoadStepper:
         """The move of the controls (unknowns,) and of the border (2,) that balances the linearised body with the exact contact."""
         eliminated = tangent.eliminated
         kept = eliminated.kept
-        forward, turns = self._eliminate(tangent, elastic), self._turned
-        volume_residual, near = balance.border_residual[1], self._nearest(problem, tangent)
-        if tangent.volume_column is not None:
-            volume_residual = volume_residual - eliminated.inner(tangent.volume_column) @ eliminated.inner(forward)
-        small = SmallContact(problem, near, tangent.volume_pivot, forward[kept], volume_residual, balance)
+        forward, volume_residual = tangent.forward(elastic, balance.border_residual[1])
+        small = SmallContact(problem, tangent, forward[kept], volume_residual, balance)
         kept_move, border_move = small.solve(balance, soften=soften, least=0.1 * RESIDUAL_TOLERANCE)
         self.inner_iterations += small.iterations
-        if tangent.volume_column is not None:
-            forward = forward + border_move[1] * tangent.volume_column
-        move = eliminated.backward(-forward, kept_move)
-        return move if turns is None else turn_vectors(turns, move), border_move
+        move = eliminated.backward(-(forward + border_move[1] * tangent.volume_column), kept_move)
+        return move if tangent.turns is None else turn_vectors(tangent.turns, move), border_move

@@ -1,5 +1,6 @@
 """Paths of the object: the poses through which it moves relative to the sensor."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,16 +17,16 @@ _LARGEST_TILT_DEG = 60.0
 """Largest tilt of a contact pose about each axis. The dome does not extend further."""
 _LARGEST_TWIST_DEG = 90.0
 """Largest twist of a contact pose: a quarter turn."""
-_TOUCH_TOLERANCE_MM = 1e-6
+TOUCH_TOLERANCE_MM = 1e-6
 """Tolerance of the first touch: largest distance between object and dome."""
-_SKIN_POINTS = 20_000
+SKIN_POINTS = 20_000
 """Number of points on a whole sphere for the first search of the nearest point: they are 0.5 mm apart on a dome of 20 mm."""
 _NEAR_POINTS = 2000
 """Number of points for the second search, around the nearest point of the first search, with a 30 times smaller distance."""
 _START_MM = 60.0
 """Height above the apex from which the object is lowered."""
-_MOST_DESCENTS = 400
-"""Largest number of steps in which the object is lowered."""
+_MOST_MARCHES = 400
+"""Largest number of steps in which the object is moved to its first touch; about ten are usual."""
 
 
 @dataclass(frozen=True)
@@ -158,9 +159,8 @@ def deepest_mm(geometry: GeometrySpec) -> float:
 def plan_path(geometry: GeometrySpec, field: ObjectField, pose: ContactPose) -> ContactPath:
     """Path of a contact pose: the poses at first touch, at full indentation, and (with shear or twist) after the shear.
 
-    To find the first touch with the undeformed skin, the object is lowered along z again and again by its smallest distance to the dome.
-    If distances are exact, it never passes the first touch (sphere tracing, Hart 1996). The points on the dome are evenly distributed in
-    the first search, and densely around the nearest point in the second.
+    To find the first touch with the undeformed skin, the object is lowered along z. The points on the dome are evenly distributed in the
+    first search, and densely around the nearest point in the second.
 
     Raises
     ------
@@ -176,12 +176,23 @@ def plan_path(geometry: GeometrySpec, field: ObjectField, pose: ContactPose) -> 
     T[:3, :3] = turn_y @ turn_x
     T[:3, 3] = [*pose.offset_mm, skin.apex_mm]
     size_mm = max(skin.half_size_mm)
-    places = shape.even(_SKIN_POINTS)
-    height, nearest = _bring_down(field, T, shape.outside(places), _START_MM, size_mm)
 
-    spread = 3 / np.sqrt(_SKIN_POINTS)
-    near = shape.outside(shape.near(complex(places[nearest]), spread, _NEAR_POINTS))
-    height, _ = _bring_down(field, T, near, height + spread * size_mm, size_mm)
+    def lower(points_mm: FloatArray, height_mm: float) -> tuple[float, int]:
+        """Height above ``T`` at which the object just touches the points, and the index of the touched point."""
+
+        def gaps_at(depth_mm: float) -> FloatArray:
+            return field.distance((points_mm - T[:3, 3] + [0, 0, depth_mm]) @ T[:3, :3])
+
+        too_late = "the object is in the skin's way before it comes down; use a smaller tilt or another offset"
+        depth_mm, nearest = march_to_touch(gaps_at, -height_mm, size_mm, too_late)
+        if nearest is None:
+            raise ContactError("the object misses the skin; use a smaller offset or tilt")
+        return -depth_mm, nearest
+
+    places = shape.even(SKIN_POINTS)
+    height, nearest = lower(shape.outside(places), _START_MM)
+    spread = 3 / np.sqrt(SKIN_POINTS)
+    height, _ = lower(shape.outside(shape.near(complex(places[nearest]), spread, _NEAR_POINTS)), height + spread * size_mm)
     T[2, 3] += height
     pressed = T.copy()
     pressed[2, 3] -= max(pose.indent_mm, 0.0)
@@ -197,7 +208,7 @@ def plan_path(geometry: GeometrySpec, field: ObjectField, pose: ContactPose) -> 
 
 def _check(geometry: GeometrySpec, pose: ContactPose) -> None:
     values = np.concatenate([[pose.indent_mm, pose.twist_deg], pose.tilt_deg, pose.shear_mm, pose.offset_mm])
-    if values.shape != (8,) or not np.isfinite(values).all():
+    if not np.isfinite(values).all():
         raise ContactError(f"a contact pose needs finite numbers, got {values}; give numbers in mm and deg")
     size = max(geometry.skin.half_size_mm)
     limits = [
@@ -212,22 +223,42 @@ def _check(geometry: GeometrySpec, pose: ContactPose) -> None:
             raise ContactError(f"{name}: {value:g} is more than {limit:g} ({reason}); give a smaller value")
 
 
-def _bring_down(field: ObjectField, T: FloatArray, points_mm: FloatArray, height_mm: float, depth_mm: float) -> tuple[float, int]:
-    """Height above ``T`` (mm) at which the object just touches the points (k, 3), and the index of the touched point."""
-    turn, shift = T[:3, :3], T[:3, 3]
-    free_mm = None
-    for _ in range(_MOST_DESCENTS):
-        distance = field.distance((points_mm - shift - [0, 0, height_mm]) @ turn)
-        nearest = int(distance.argmin())
-        if abs(distance[nearest]) <= _TOUCH_TOLERANCE_MM:
-            return height_mm, nearest
-        if distance[nearest] > 0:
-            free_mm = height_mm
-            height_mm -= distance[nearest]
-        elif free_mm is None:
-            raise ContactError("the object is in the skin's way before it comes down; use a smaller tilt or another offset")
+def march_to_touch(
+    gaps_at: Callable[[float], FloatArray], at: float, stop: float, too_late: str, *, unit_mm: float = 1.0
+) -> tuple[float, int | None]:
+    """Move an object from ``at`` up to ``stop`` to its first touch, by its smallest gap to the skin again and again.
+
+    If distances are exact, it never passes the first touch (sphere tracing, Hart 1996).
+
+    Parameters
+    ----------
+    gaps_at : callable
+        Function that returns the gaps (k,) in mm of points of the skin with the object at a place of its way.
+    too_late : str
+        Message of the ContactError for an object that begins inside the skin.
+    unit_mm : float
+        Length of the unit of ``at`` and ``stop``.
+
+    Returns
+    -------
+    at : float
+        Place of the first touch. It is beyond ``stop`` if there is none, and the last place without contact if the search does not end.
+    nearest : int or None
+        Index of the touched point.
+    """
+    free: float | None = None  # the last place without contact
+    for _ in range(_MOST_MARCHES):
+        gaps = gaps_at(at)
+        nearest = int(gaps.argmin())
+        if abs(gaps[nearest]) <= TOUCH_TOLERANCE_MM:
+            return at, nearest
+        if gaps[nearest] > 0:
+            free = at
+            at += gaps[nearest] / unit_mm
+        elif free is None:
+            raise ContactError(too_late)
         else:  # the distance was too large, which happens near wires and far from a mesh: go back half of the step
-            height_mm = (height_mm + free_mm) / 2
-        if height_mm < -depth_mm:
-            break
-    raise ContactError("the object misses the skin; use a smaller offset or tilt")
+            at = (at + free) / 2
+        if at > stop:
+            return at, None
+    return free or 0.0, None

@@ -10,8 +10,6 @@ over t and x together, with the equilibrium linearised about the present shape i
 previous step, and s_t^2 with a fraction of this pressure (iteratively reweighted least squares: Daubechies et al. 2010). These scales
 express three properties of a contact: it presses and does not pull, it is confined to a part of the skin, and friction needs pressure.
 A discrepancy of a fraction of a pixel remains in the image. Each pin is finally shifted parallel to the image to remove it.
-
-`SoftBody` treats skin and gel as one dense system: it computes forces, and a factor of the stiffness at any shape.
 """
 
 from dataclasses import dataclass, replace
@@ -21,15 +19,13 @@ from scipy import sparse
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from threadpoolctl import ThreadpoolController
 
-from scenes.body import GelSpec
-from scenes.sensor import GeometrySpec, SensorSpec, ViewSpec
+from scenes.sensor import SensorSpec, ViewSpec
 from twin.camera.projection import pixel_rays, project
+from twin.geometry.pins import PinRest
 from twin.geometry.solid import build_solid, pin_pose, surface_operators
 from twin.mechanics.body.elements import PAIRS, soft_body
 from twin.types import BoolArray, FloatArray, IntArray
 
-NO_STRESS = np.zeros((0, 8, 3, 3))
-"""Given stress of an elastic body: none (see ``Elements.add_forces``)."""
 SHIFT_SHARE = 1e-3
 """First shift of the diagonal of a tangent that is not positive definite, relative to the mean of the diagonal. If the shift is too small,
 the next one is four times as large."""
@@ -57,7 +53,7 @@ FRICTION = 0.5
 
 
 @dataclass(frozen=True)
-class FittedPins:
+class FittedPins(PinRest):
     """Pins of a fitted skin, in the sensor frame and in the specification's order. The renderer accepts them as a state.
 
     Attributes
@@ -70,9 +66,6 @@ class FittedPins:
         Total force on the skin: the integral of the estimated traction.
     """
 
-    base_mm: FloatArray
-    axis: FloatArray
-    caps_mm: FloatArray
     remainder_px: FloatArray
     force_n: FloatArray
 
@@ -89,14 +82,19 @@ def centroid_offset_px(view: ViewSpec, cap_diameter_mm: float, caps_mm: FloatArr
 
 
 class SkinFit:
-    """Fit of one sensor's skin to the pins of frames. Everything that depends on the sensor alone is computed once, in the constructor."""
+    """Fit of one sensor's skin to the pins of frames. Everything that depends on the sensor alone is computed once, in the constructor.
+
+    Skin and gel are one dense system, with a factor of the stiffness at any shape.
+    """
 
     def __init__(self, spec: SensorSpec) -> None:
-        self.spec = spec
-        self._blas = ThreadpoolController()
-        self._view = spec.view
-        self._body = SoftBody(spec.geometry, spec.gel)
-        solid = self._solid = self._body.solid
+        self.spec, self._view, self._blas = spec, spec.view, ThreadpoolController()
+        solid = self._solid = build_solid(spec.geometry)
+        self._kinds = soft_body(solid, spec.skin, spec.gel)
+        self._free = np.flatnonzero(~solid.fixed)
+        unknown = np.full((len(solid.fixed), 3), -1)  # indices of each control's three unknowns; -1 where clamped
+        unknown[self._free] = np.arange(3 * len(self._free)).reshape(-1, 3)
+        self._entries = [_entries(unknown, kind.cells.controls) for kind in self._kinds]
         at, weights = (a.ravel() for a in solid.basis.gauss(2))
         v, u = (g.ravel() for g in np.meshgrid(at, at, indexing="ij"))
         value, *slopes = surface_operators(solid.basis, np.column_stack([u, v]))
@@ -106,7 +104,7 @@ class SkinFit:
         across = np.cross(*(s @ solid.control_mm[self._outer] for s in self._slopes))
         self._area_mm2 = np.linalg.norm(across, axis=1) * np.outer(weights, weights).ravel()
         self._mass = (self._value.T @ (self._area_mm2[:, None] * self._value)).toarray()  # traction coefficients to forces
-        self._loaded = self._body.unknown[self._outer][moving]  # (m, 3) unknowns that carry the traction
+        self._loaded = unknown[self._outer][moving]  # (m, 3) unknowns that carry the traction
 
     def __call__(self, pins_px: FloatArray, *, centroids: bool = True) -> FittedPins:
         """Fit one frame.
@@ -136,7 +134,7 @@ class SkinFit:
                 target_px = pins_px - self._offset_px(control) * centroids
                 move, traction = self._step(control, target_px, seen, traction, even=step < EVEN_STEPS)
                 largest = np.abs(move).max()
-                control = self._body.move_controls(control, move * min(1.0, LARGEST_MOVE_MM / largest))
+                control = self._move_controls(control, move * min(1.0, LARGEST_MOVE_MM / largest))
                 if step >= EVEN_STEPS and largest < SETTLED_MM:
                     break
             pins = self._on_rays(control, pins_px - self._offset_px(control) * centroids, seen)
@@ -160,7 +158,10 @@ class SkinFit:
         self, control: FloatArray, target_px: FloatArray, seen: BoolArray, traction: FloatArray, *, even: bool
     ) -> tuple[FloatArray, FloatArray]:
         """One Gauss-Newton step: the move (f, 3) of the free controls, and the traction (q, 3) in MPa at the skin's points."""
-        factor, force = self._body.factor(control), self._body.forces(control)
+        factor, force = self._factor(control), np.zeros_like(control)
+        for kind in self._kinds:
+            kind.add_forces(control, force)
+        force = force[self._free].ravel()
         seen_px, per_control = self._pin_rows(control, seen)
         reach = cho_solve(factor, per_control.T)  # (unknowns, 2 pins): displacement of the pins in the image per unit force
         rows = np.einsum("ab,bip->pai", self._mass, reach[self._loaded], optimize=True).reshape(len(per_control), -1)
@@ -190,58 +191,30 @@ class SkinFit:
         """Projections (s, 2) of the visible caps, and their derivative (2 s, unknowns) with respect to the free controls."""
         solid, inner = self._solid, control[self._solid.inner]
         _, axis, cap = pin_pose(solid, control)
-        slopes = solid.pin_slope_u, solid.pin_slope_v
+        value, *slopes = solid.pin_rows
         t = np.stack([s @ inner for s in slopes], axis=1)
         dual = np.linalg.inv(t @ t.swapaxes(1, 2)) @ t
         here = project(self._view, cap)
         per_mm = np.stack([(project(self._view, cap + PROBE_MM * unit) - here) / PROBE_MM for unit in np.eye(3)], axis=2)
         rows = np.zeros((seen.sum(), 2, len(control), 3))
-        part = solid.pin_value[seen, None, :, None] * per_mm[seen, :, None, :]
+        part = value[seen, None, :, None] * per_mm[seen, :, None, :]
         for slope, toward in zip(slopes, dual.swapaxes(0, 1), strict=True):  # the axis rotates with the normal: d a = -t^c (a . d t_c)
             lever = -solid.pin_cap_length_mm * np.einsum("pki,pi->pk", per_mm, toward)
             part += slope[seen, None, :, None] * (lever[..., None] * axis[:, None])[seen, :, None, :]
         rows[:, :, solid.inner] = part
-        return here[seen], rows[:, :, self._body.free].reshape(2 * seen.sum(), -1)
+        return here[seen], rows[:, :, self._free].reshape(2 * seen.sum(), -1)
 
-
-class SoftBody:
-    """The elastic body of one sensor.
-
-    Attributes
-    ----------
-    solid : Solid
-    free : (f,) int
-        Controls that are not clamped.
-    unknown : (n, 3) int
-        Indices of each control's three unknowns; -1 where clamped.
-    """
-
-    def __init__(self, geometry: GeometrySpec, gel: GelSpec) -> None:
-        solid = self.solid = build_solid(geometry)
-        self._kinds = soft_body(solid, geometry.skin, gel)
-        self.free = np.flatnonzero(~solid.fixed)
-        self.unknown = np.full((len(solid.fixed), 3), -1)
-        self.unknown[self.free] = np.arange(3 * len(self.free)).reshape(-1, 3)
-        self._entries = [_entries(self.unknown, kind.cells.controls) for kind in self._kinds]
-
-    def forces(self, control_mm: FloatArray) -> FloatArray:
-        """Gradient (3 f,) of the elastic energy with respect to the free controls, N."""
-        force = np.zeros_like(control_mm)
-        for kind in self._kinds:
-            kind.add_forces(control_mm, NO_STRESS, force)
-        return force[self.free].ravel()
-
-    def factor(self, control_mm: FloatArray) -> tuple[FloatArray, bool]:
+    def _factor(self, control_mm: FloatArray) -> tuple[FloatArray, bool]:
         """Cholesky factor of the tangent in single precision, for ``scipy.linalg.cho_solve``.
 
         If the tangent is not positive definite, its diagonal is shifted until it is.
         """
-        size = 3 * len(self.free)
+        size = 3 * len(self._free)
         total = np.zeros(size * size)
         for kind, (where, from_block) in zip(self._kinds, self._entries, strict=True):
             controls = kind.cells.controls
             block = np.zeros((len(controls), 6, controls.shape[1], controls.shape[1]))
-            kind.stiffness(control_mm, NO_STRESS, 0.0, block)
+            kind.stiffness(control_mm, 0.0, block)
             total += np.bincount(where, block.ravel()[from_block], size * size)
         matrix, shift = total.reshape(size, size).astype(np.float32), 0.0
         while True:
@@ -251,12 +224,12 @@ class SoftBody:
                 shift = 4 * shift or SHIFT_SHARE * float(np.mean(np.diag(matrix)))
                 matrix[np.diag_indices(size)] += shift
 
-    def move_controls(self, control_mm: FloatArray, move_mm: FloatArray) -> FloatArray:
+    def _move_controls(self, control_mm: FloatArray, move_mm: FloatArray) -> FloatArray:
         """The shape (n, 3) after a move (f, 3) of the free controls. The move is halved until no element is inside out."""
         while True:
             moved = control_mm.copy()
-            moved[self.free] += move_mm
-            if np.isfinite(sum(kind.add_forces(moved, NO_STRESS, np.zeros_like(moved)) for kind in self._kinds)):
+            moved[self._free] += move_mm
+            if np.isfinite(sum(kind.add_forces(moved, np.zeros_like(moved)) for kind in self._kinds)):
                 return moved
             move_mm = move_mm / 2
 

@@ -1,7 +1,8 @@
-"""Solver of contacts: it computes converged states of a sensor along an object's path."""
+"""Solver of contacts: it computes converged states of a sensor along an object's path, of one contact or of many in parallel."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import pairwise
 from typing import Any
@@ -11,20 +12,19 @@ from threadpoolctl import ThreadpoolController
 
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
-from twin.errors import ContactError
-from twin.geometry.chart import Focus
+from twin.errors import ContactError, MeshError
 from twin.geometry.mesh import NodeView, build_mesh
-from twin.geometry.shapes import shape_of
-from twin.geometry.solid import Resolution, build_solid, pin_pose
-from twin.mechanics.balance import Body, Friction
-from twin.mechanics.body.elements import soft_body
-from twin.mechanics.contact import contact_points
-from twin.mechanics.law import ContactLaw
-from twin.mechanics.newton import LoadStepper
-from twin.mechanics.ongoing import OngoingContact, Setting
+from twin.geometry.shapes import Focus, shape_of
+from twin.geometry.solid import Resolution, Solid, build_solid, pin_pose
+from twin.mechanics.balance import Balance, Body, LoadState, in_object
+from twin.mechanics.body.elements import History, soft_body
+from twin.mechanics.contact import contact_points, touching_mm2
+from twin.mechanics.law import ContactLaw, Friction
+from twin.mechanics.newton import RESIDUAL_TOLERANCE, LoadStepper, NoConvergence
 from twin.mechanics.path import ContactPath, ContactPose, carry_points, deepest_mm, plan_path
 from twin.objects import ObjectField, build_field
-from twin.types import ContactState, FloatArray
+from twin.types import ContactState, FloatArray, IntArray
+from twin.workers import in_processes
 
 _STEP_MM = 0.4
 """Default of the largest motion of the object at any pressed point of the skin in one load step, mm."""
@@ -58,6 +58,135 @@ _MISSED_MM = 0.5
 """Largest depth of an object's origin inside the skin at rest, mm, at which the skin's mesh may not yet have met the object."""
 _START_INSIDE_MM = 0.05
 """Largest penetration of the undeformed skin at the start of a path, mm. It allows for the rounding of a first touch."""
+_PENALTY_MPA_MM = 30.0
+"""Penalty at the start of every contact, MPa per mm of penetration. With it, usual pressures give penetrations below
+``newton.GAP_BOUND_MM``."""
+_SMALLEST_STRIDE = 1 / 64
+"""Smallest fraction of a regular load step. If a step of this length does not converge, the contact does not converge."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A solid and the quantities derived from it.
+
+    Attributes
+    ----------
+    solid : Solid
+    body : Body
+    view : NodeView
+    """
+
+    solid: Solid
+    body: Body
+    view: NodeView
+
+
+class OngoingContact:
+    """One contact from its first touch on, with the history of friction and relaxation from step to step (see ``SkinSolver.begin``).
+
+    Attributes
+    ----------
+    setting : Setting
+    stepper : LoadStepper
+    load : LoadState
+        The last converged state.
+    """
+
+    def __init__(self, solver: "SkinSolver", field: ObjectField, law: ContactLaw, T: FloatArray, focus: Focus) -> None:
+        self._one_thread = solver.one_thread
+        with self._one_thread():
+            setting = self.setting = solver.setting_of(focus)
+        body, control_mm, border = setting.body, setting.solid.control_mm, np.zeros(2)
+        self.stepper = LoadStepper(body, list(setting.solid.boxes), field, law)
+        gap_mm = field.distance(in_object(body.points.positions(control_mm), T, border))
+        none = np.zeros(len(gap_mm))
+        self.load = LoadState(control_mm, border, np.zeros((len(none), 3)), none > 0, none, none, gap_mm, _PENALTY_MPA_MM, T)
+        gel = solver.spec.gel.relaxation
+        self._terms = solver.spec.skin.relaxation, gel, gel
+        self._past = [History.at_rest(kind, term) for kind, term in zip(body.kinds, self._terms, strict=True)]
+
+    def step(self, T: FloatArray, span_s: float) -> ContactState:
+        """The converged state with the object at ``T`` (4, 4), ``span_s`` after the last one. ``NoConvergence`` changes nothing."""
+        kinds = self.setting.body.kinds
+        now = tuple(p.before(kind, term, span_s) for p, kind, term in zip(self._past, kinds, self._terms, strict=True))
+        with self._one_thread():
+            self.load, balance, looked = self.stepper.step(self.load, T, now)
+            result = contact_state(self.setting, self.load, balance, looked)
+        control_mm = self.load.control_mm
+        self._past = [p.after(kind, term, span_s, control_mm) for p, kind, term in zip(self._past, kinds, self._terms, strict=True)]
+        return result
+
+    def advance(
+        self, pose_at: Callable[[float], FloatArray], start: float, stop: float, time_at: Callable[[float], float], where: str
+    ) -> Iterator[tuple[float, ContactState]]:
+        """Compute one regular load step, or several shorter ones where it does not converge.
+
+        Parameters
+        ----------
+        pose_at, time_at : callable
+            Functions that return the object's pose (4, 4) and the time (s) at a progress from ``start`` to ``stop``.
+        where : str
+            Name of the load step, for the message of an error.
+
+        Yields
+        ------
+        progress : float
+        state : ContactState
+
+        Raises
+        ------
+        ContactError
+            If the smallest step does not converge.
+        """
+        done, stride = 0.0, 1.0
+        while done < 1:
+            stride = min(stride, 1 - done)
+            before, at = start + done * (stop - start), start + (done + stride) * (stop - start)
+            try:
+                result = self.step(pose_at(at), time_at(at) - time_at(before))
+            except NoConvergence as failure:
+                stride /= 2
+                if stride >= _SMALLEST_STRIDE:
+                    continue
+                raise ContactError(
+                    f"no convergence in {where}: relative residual {failure.relative:.1e}, needed {RESIDUAL_TOLERANCE:.0e}; "
+                    "try less indentation, shear or friction, a rounder object, or another resolution"
+                ) from None
+            done += stride
+            stride = min(2 * stride, 1.0)
+            yield at, result
+
+
+def contact_state(setting: Setting, state: LoadState, balance: Balance, looked: IntArray) -> ContactState:
+    """The public state of a converged load step; ``looked`` (q,) int are the indices of the contact points in ``balance``."""
+    contact, points = balance.contact, setting.body.points
+    touched = np.flatnonzero(contact.penetration_mm > 0)
+    where = looked[touched]
+    turn = state.T[:3, :3]
+    at = points.positions(state.control_mm)[where]
+    normal = contact.normal[touched] @ turn.T
+    force = -balance.point_force_n[touched]
+    normal_n = contact.normal_n[touched]
+    pose = state.T.copy()
+    pose[2, 3] += state.border[0]
+    return ContactState(
+        setting.view.nodes(state.control_mm),
+        *pin_pose(setting.solid, state.control_mm),
+        force_n=force.sum(axis=0),
+        torque_nmm=np.cross(at, force).sum(axis=0),
+        area_mm2=touching_mm2(points, state.gap_mm) if len(where) else 0.0,
+        contact_mm=at,
+        contact_place=points.place[where],
+        normal=normal,
+        normal_n=normal_n,
+        tangential_n=force + normal_n[:, None] * normal,
+        point_area_mm2=points.area_mm2[where],
+        slipping=contact.slipping[touched],
+        T_sensor_object=pose,
+        elastic_nmm=state.elastic_nmm,
+        dissipated_nmm=state.dissipated_nmm,
+        residual=balance.relative,
+    )
 
 
 class SkinSolver:
@@ -73,14 +202,18 @@ class SkinSolver:
     mesh : SensorMesh
     shape : SkinShape
         Shape of the undeformed skin.
+    relaxes : bool
+        Whether skin or gel are viscoelastic.
+    setting_of : callable
+        Function that gives the ``Setting`` of a ``Focus``.
     """
 
     def __init__(self, spec: SensorSpec, *, resolution: Resolution | None = None) -> None:
         self.spec, self.resolution = spec, resolution or Resolution()
         self.mesh = build_mesh(spec.geometry)
-        self.shape = shape_of(spec.skin)
+        self.shape, self.relaxes = shape_of(spec.skin), bool(spec.skin.relaxation or spec.gel.relaxation)
         self._blas = ThreadpoolController()
-        self._setting = lru_cache(maxsize=_KEPT_SOLIDS)(self._set_up)
+        self.setting_of = lru_cache(maxsize=_KEPT_SOLIDS)(self._set_up)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled as its specification: a copy computes the rest again."""
@@ -88,10 +221,10 @@ class SkinSolver:
 
     def rest(self, *, T_sensor_object: FloatArray | None = None) -> ContactState:
         """The undeformed sensor."""
-        with self._one_thread():
-            setting = self._setting(Focus())
-        base, axis, caps = pin_pose(setting.solid, setting.solid.control_mm)
-        return ContactState.undeformed(self.mesh.nodes_mm, base, axis, caps, T_sensor_object=T_sensor_object)
+        with self.one_thread():
+            setting = self.setting_of(Focus())
+        pins = pin_pose(setting.solid, setting.solid.control_mm)
+        return ContactState.undeformed(self.mesh.nodes_mm, *pins, T_sensor_object=T_sensor_object)
 
     def press(
         self,
@@ -176,12 +309,9 @@ class SkinSolver:
 
     def begin(self, field: ObjectField, law: ContactLaw, T: FloatArray, *, focus: Focus) -> OngoingContact:
         """A new contact. The object is at ``T`` (4, 4), without contact; the grid of the solid is fine at ``focus``."""
-        with self._one_thread():
-            setting = self._setting(focus)
-        stepper = LoadStepper(setting.body, list(setting.solid.boxes), field, law.friction, law.compliance_mm_per_n)
-        return OngoingContact(setting, stepper, T, self._one_thread)
+        return OngoingContact(self, field, law, T, focus)
 
-    def _one_thread(self) -> AbstractContextManager[object]:
+    def one_thread(self) -> AbstractContextManager[object]:
         """BLAS on one thread: the matrices are small, and the result must not depend on the number of cores."""
         return self._blas.limit(limits=1, user_api="blas")
 
@@ -190,8 +320,7 @@ class SkinSolver:
         solid = build_solid(spec.geometry, resolution=self.resolution, focus=focus)
         points = contact_points(solid, self.shape)
         body = Body(soft_body(solid, spec.skin, spec.gel), points, ~solid.fixed, spec.gel.sealed)
-        relaxation = spec.skin.relaxation, spec.gel.relaxation, spec.gel.relaxation
-        return Setting(solid, body, NodeView.of(self.mesh, solid), relaxation)
+        return Setting(solid, body, NodeView(self.mesh, solid))
 
     def _find_reached_points(self, field: ObjectField, plan: ContactPath) -> FloatArray:
         """Points (k, 3) of the undeformed skin inside the object at some pose of the path, or else the nearest point.
@@ -219,7 +348,7 @@ class SkinSolver:
 
         A skin that relaxes may still have a dent where the object was.
         """
-        if state.force_n.any() or self.spec.skin.relaxation or self.spec.gel.relaxation:
+        if state.force_n.any() or self.relaxes:
             return
         tip_mm = state.T_sensor_object[None, :3, 3]
         above_mm = self.shape.on_outside(tip_mm)
@@ -295,3 +424,69 @@ def _stops(plan: ContactPath, points_mm: FloatArray, step_mm: float) -> FloatArr
         count = max(1, int(np.ceil(np.linalg.norm(moved, axis=1).max() / step_mm)))
         out.append(leg + np.arange(1, count + 1) / count)
     return np.concatenate(out)
+
+
+@dataclass(frozen=True)
+class ContactJob:
+    """One contact to solve (see ``SkinSolver.path``); ``every_state`` keeps the states of all load steps, not only the last one."""
+
+    obj: ObjectSpec
+    pose: ContactPose | ContactPath
+    friction: float | Friction | None = None
+    every_state: bool = False
+
+
+@dataclass(frozen=True)
+class ContactOutcome:
+    """Result of a job.
+
+    Attributes
+    ----------
+    number : int
+        Index of the job.
+    states : list of ContactState
+        Converged states in the order of the path: all of them with ``every_state``, else the last one; none if the job failed.
+    error : str
+        Message of the failure, "" if the job succeeded.
+    """
+
+    number: int
+    states: list[ContactState]
+    error: str = ""
+
+
+def press_many(
+    spec: SensorSpec, jobs: Sequence[ContactJob], *, processes: int = 1, resolution: Resolution | None = None
+) -> Iterator[ContactOutcome]:
+    """Solve contacts and yield their outcomes as they finish; the states do not depend on the number of processes.
+
+    A contact that fails does not stop the others: its outcome contains the message.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+    jobs : sequence of ContactJob
+    processes : int
+        Number of processes (see ``in_processes``).
+
+    Raises
+    ------
+    ValueError
+        ``processes`` is less than 1.
+    WorkersError
+        Processes died repeatedly.
+    """
+    yield from in_processes(_begin, (spec, resolution), list(enumerate(jobs)), processes=processes)
+
+
+def _begin(spec: SensorSpec, resolution: Resolution | None) -> Callable[[tuple[int, ContactJob]], ContactOutcome]:
+    return partial(_solve, SkinSolver(spec, resolution=resolution))
+
+
+def _solve(solver: SkinSolver, task: tuple[int, ContactJob]) -> ContactOutcome:
+    number, job = task
+    try:
+        states = [state for _, state in solver.path(job.obj, job.pose, friction=job.friction)]
+    except (ContactError, MeshError) as error:
+        return ContactOutcome(number, [], str(error))
+    return ContactOutcome(number, states if job.every_state else states[-1:])

@@ -26,7 +26,7 @@ class Turns:
 
     def __init__(self, body: Body) -> None:
         self._kinds = [
-            (kind.cells.controls, kind.cells.mean_gradients, (kind.law[0] + kind.law[1]) * kind.cells.weights_mm3.sum(axis=1))
+            (kind.cells.controls, kind.cells.gradients.mean(axis=1), (kind.law[0] + kind.law[1]) * kind.cells.weights_mm3.sum(axis=1))
             for kind in body.kinds
         ]
         self._free = body.free

@@ -2,15 +2,171 @@
 
 Every solid has ``probe`` (and therefore ``distance`` and ``gradient``) and ``unroll``, which gives texture coordinates: two lengths
 (k, 2) in mm along the surface below a point, with their gradients (k, 2, 3) and their Hessians (k, 2, 3, 3) in 1/mm.
+Compiled functions give distance (k,), unit gradient (k, 3) and Hessian (k, 3, 3) at points (k, 3) in one pass each. Around a point, a
+sphere or a straight line at a distance r, the Hessian of the distance is (I - n n - a a) / r with the normal n and the line's direction a
+(none for a point); over a flat face it is zero.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
-from twin.objects import kernels
-from twin.objects.level_set import Probe, Wrapped, rows
+import numpy as np
+
+from twin.compiled import compiled
+from twin.objects.level_set import Probe, Triple, Wrapped, rows
 from twin.types import FloatArray
+
+_CREASE_MM = 1e-3
+"""Radius of curvature below which a surface counts as a crease. The Hessian of a crease is set to 0."""
+PLANE, ROUND, EDGE, PRISM = range(4)
+"""Codes of the kinds of solids, for compiled code that handles all of them."""
+
+
+@compiled(error_model="numpy")
+def _results(count: int) -> Probe:
+    return np.empty(count), np.zeros((count, 3)), np.zeros((count, 3, 3))
+
+
+@compiled(error_model="numpy")
+def _write(normal: FloatArray, hessian: FloatArray, k: int, n: Triple, a: Triple, radius: float) -> None:
+    """Write point k's normal n and Hessian (I - n n - a a) / radius. Plain numbers are used, because slices of arrays would be slower."""
+    normal[k, 0], normal[k, 1], normal[k, 2] = n
+    if radius > _CREASE_MM:
+        r = 1 / radius
+        hessian[k, 0, 0] = r * (1 - n[0] * n[0] - a[0] * a[0])
+        hessian[k, 1, 1] = r * (1 - n[1] * n[1] - a[1] * a[1])
+        hessian[k, 2, 2] = r * (1 - n[2] * n[2] - a[2] * a[2])
+        hessian[k, 0, 1] = hessian[k, 1, 0] = -r * (n[0] * n[1] + a[0] * a[1])
+        hessian[k, 0, 2] = hessian[k, 2, 0] = -r * (n[0] * n[2] + a[0] * a[2])
+        hessian[k, 1, 2] = hessian[k, 2, 1] = -r * (n[1] * n[2] + a[1] * a[2])
+
+
+@compiled(error_model="numpy")
+def plane(points: FloatArray) -> Probe:
+    """Half space behind the origin."""
+    distance, normal, hessian = _results(len(points))
+    for k in range(len(points)):
+        distance[k] = -points[k, 2]
+        normal[k, 2] = -1.0
+    return distance, normal, hessian
+
+
+@compiled(error_model="numpy")
+def round_solid(points: FloatArray, radius: float, along_y: float) -> Probe:
+    """Ball, or cylinder along y (``along_y`` 1.0, for the ball 0.0), behind the origin."""
+    distance, normal, hessian = _results(len(points))
+    for k in range(len(points)):
+        x, y, z = points[k, 0], points[k, 1] * (1 - along_y), points[k, 2] - radius
+        away = np.sqrt(x * x + y * y + z * z)
+        distance[k] = away - radius
+        n = (x / away, y / away, z / away) if away > 0 else (0.0, 0.0, -1.0)
+        _write(normal, hessian, k, n, (0.0, along_y, 0.0), away)
+    return distance, normal, hessian
+
+
+@compiled(error_model="numpy")
+def edge(points: FloatArray, fillet: float) -> Probe:
+    """Quarter space with a rounded edge along y."""
+    distance, normal, hessian = _results(len(points))
+    for k in range(len(points)):
+        # distances of the point in front of the faces, which are moved inwards by the fillet
+        x, z = fillet - points[k, 0], fillet - points[k, 2]
+        if x > 0 and z > 0:
+            away = np.sqrt(x * x + z * z)
+            distance[k] = away - fillet
+            _write(normal, hessian, k, (-x / away, 0.0, -z / away), (0.0, 1.0, 0.0), away)
+        else:
+            face = 0 if x >= z else 2
+            distance[k] = -points[k, face]
+            normal[k, face] = -1.0
+    return distance, normal, hessian
+
+
+@compiled(error_model="numpy")
+def _sector(x: float, z: float, sides: int) -> int:
+    """Number of the nearest face around the axis."""
+    return int(np.floor(np.arctan2(x, -z) * sides / (2 * np.pi) + 0.5))
+
+
+@compiled(error_model="numpy")
+def prism(points: FloatArray, sides: int, inradius: float, fillet: float, taper: float) -> Probe:
+    """Prism. Each point is rotated into the sector of its nearest face, with the coordinates: outwards, along the face, y.
+
+    In this sector the nearest point of the polyhedron, whose faces are moved inwards by the fillet, is on that face or on the edge
+    between two faces.
+    """
+    distance, normal, hessian = _results(len(points))
+    lean_out, lean_y = np.cos(taper), np.sin(taper)
+    half = np.tan(np.pi / sides)
+    size = np.sqrt(1 + (lean_y * half) ** 2)
+    edge_out, edge_along, edge_y = -lean_y / size, -lean_y * half / size, lean_out / size
+    corner = inradius - fillet / lean_out
+    turns = [(np.cos(2 * np.pi / sides * face), np.sin(2 * np.pi / sides * face)) for face in range(sides)]
+    for k in range(len(points)):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2] - inradius
+        cos, sin = turns[_sector(x, z, sides) % sides]
+        out, along = x * sin - z * cos, x * cos + z * sin
+        mirror = -1.0 if along < 0 else 1.0
+        along = abs(along)
+        height = out * lean_out + y * lean_y - (inradius * lean_out - fillet)
+        p, q, r = lean_out, 0.0, lean_y
+        away = 0.0
+        distance[k] = height - fillet
+        if height > 0 and along > (out - height * lean_out) * half:
+            p, q, r = out - corner, along - corner * half, y
+            slide = p * edge_out + q * edge_along + r * edge_y
+            p, q, r = p - slide * edge_out, q - slide * edge_along, r - slide * edge_y
+            away = np.sqrt(p * p + q * q + r * r)
+            distance[k] = away - fillet
+            p, q, r = p / away, q / away, r / away
+        n = (p * sin + q * mirror * cos, r, -p * cos + q * mirror * sin)
+        a = (edge_out * sin + edge_along * mirror * cos, edge_y, -edge_out * cos + edge_along * mirror * sin)
+        _write(normal, hessian, k, n, a, away)
+    return distance, normal, hessian
+
+
+@compiled(error_model="numpy")
+def solid(points: FloatArray, kind: int, sizes: FloatArray) -> Probe:
+    """The solid of a kind, with the numbers that its function takes, in their order."""
+    if kind == ROUND:
+        return round_solid(points, sizes[0], sizes[1])
+    if kind == EDGE:
+        return edge(points, sizes[0])
+    if kind == PRISM:
+        return prism(points, int(sizes[0]), sizes[1], sizes[2], sizes[3])
+    return plane(points)
+
+
+@compiled(error_model="numpy")
+def unroll_cylinder(points: FloatArray, radius: float) -> Probe:
+    """Lengths along the surface of a cylinder instead of across it."""
+    along, slope, bend = np.empty((len(points), 2)), np.zeros((len(points), 2, 3)), np.zeros((len(points), 2, 3, 3))
+    for k in range(len(points)):
+        x, z = points[k, 0], points[k, 2] - radius
+        square = max(x * x + z * z, _CREASE_MM**2)
+        along[k, 0], along[k, 1] = radius * np.arctan2(x, -z), points[k, 1]
+        slope[k, 0, 0], slope[k, 0, 2] = -z * radius / square, x * radius / square
+        slope[k, 1, 1] = 1.0
+        bend[k, 0, 0, 0] = 2 * x * z * radius / square**2
+        bend[k, 0, 2, 2] = -bend[k, 0, 0, 0]
+        bend[k, 0, 0, 2] = bend[k, 0, 2, 0] = (z * z - x * x) * radius / square**2
+    return along, slope, bend
+
+
+@compiled(error_model="numpy")
+def unroll_prism(points: FloatArray, sides: int, inradius: float) -> Probe:
+    """Lengths along the surface of a prism instead of across it."""
+    along, slope, bend = np.empty((len(points), 2)), np.zeros((len(points), 2, 3)), np.zeros((len(points), 2, 3, 3))
+    width = 2 * inradius * np.tan(np.pi / sides)
+    for k in range(len(points)):
+        x, z = points[k, 0], points[k, 2] - inradius
+        number = _sector(x, z, sides)
+        face = 2 * np.pi / sides * number
+        cos, sin = np.cos(face), np.sin(face)
+        along[k, 0], along[k, 1] = x * cos + z * sin + number * width, points[k, 1]
+        slope[k, 0, 0], slope[k, 0, 2], slope[k, 1, 1] = cos, sin, 1.0
+    return along, slope, bend
 
 
 class CompiledSolid(Wrapped):
@@ -19,18 +175,21 @@ class CompiledSolid(Wrapped):
     Attributes
     ----------
     kind : int
-        See ``kernels.solid``.
+        See ``solid``.
     kernel : callable
         Function of the points and the ``sizes``.
+    further : tuple of float
+        Numbers that the kernel takes besides the solid's fields.
     """
 
     kind: ClassVar[int]
     kernel: ClassVar[Callable[..., Probe]]
+    further: ClassVar[tuple[float, ...]] = ()
 
     @property
     def sizes(self) -> tuple[float, ...]:
-        """The numbers that ``kernel`` takes: the solid's fields, in their order."""
-        return tuple(vars(self).values())
+        """The numbers that ``kernel`` takes: the solid's fields, in their order, and ``further`` ones."""
+        return *vars(self).values(), *self.further
 
     def probe(self, points_mm: FloatArray) -> Probe:
         return type(self).kernel(rows(points_mm), *self.sizes)
@@ -40,7 +199,7 @@ class CompiledSolid(Wrapped):
 class Plane(CompiledSolid):
     """Half space z >= 0."""
 
-    kind, kernel = kernels.PLANE, staticmethod(kernels.plane)
+    kind, kernel = PLANE, staticmethod(plane)
 
 
 @dataclass(frozen=True)
@@ -49,11 +208,7 @@ class Sphere(CompiledSolid):
 
     radius_mm: float
 
-    kind, kernel = kernels.ROUND, staticmethod(kernels.round_solid)
-
-    @property
-    def sizes(self) -> tuple[float, ...]:
-        return self.radius_mm, 0.0
+    kind, kernel, further = ROUND, staticmethod(round_solid), (0.0,)
 
 
 @dataclass(frozen=True)
@@ -62,14 +217,10 @@ class Cylinder(CompiledSolid):
 
     radius_mm: float
 
-    kind, kernel = kernels.ROUND, staticmethod(kernels.round_solid)
-
-    @property
-    def sizes(self) -> tuple[float, ...]:
-        return self.radius_mm, 1.0
+    kind, kernel, further = ROUND, staticmethod(round_solid), (1.0,)
 
     def unroll(self, points_mm: FloatArray) -> Probe:
-        return kernels.unroll_cylinder(rows(points_mm), self.radius_mm)
+        return unroll_cylinder(rows(points_mm), self.radius_mm)
 
 
 @dataclass(frozen=True)
@@ -78,7 +229,7 @@ class Edge(CompiledSolid):
 
     fillet_mm: float
 
-    kind, kernel = kernels.EDGE, staticmethod(kernels.edge)
+    kind, kernel = EDGE, staticmethod(edge)
 
 
 @dataclass(frozen=True)
@@ -94,7 +245,7 @@ class Prism(CompiledSolid):
     fillet_mm: float
     taper_rad: float
 
-    kind, kernel = kernels.PRISM, staticmethod(kernels.prism)
+    kind, kernel = PRISM, staticmethod(prism)
 
     def unroll(self, points_mm: FloatArray) -> Probe:
-        return kernels.unroll_prism(rows(points_mm), self.sides, self.inradius_mm)
+        return unroll_prism(rows(points_mm), self.sides, self.inradius_mm)

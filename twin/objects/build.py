@@ -60,25 +60,16 @@ class WireMesh(ObjectField):
     wire_diameter_mm: float
 
     def probe(self, points_mm: FloatArray) -> Probe:
-        distance, slope, hessian = self.base.probe(points_mm)
-        along, along_slope, along_bend = self.base.unroll(points_mm)
-        _lay_wires(distance, slope, hessian, along, along_slope, along_bend, self.pitch_mm, self.wire_diameter_mm)
-        unit_normals(slope, hessian)
-        return distance, slope, hessian
+        found = self.base.probe(points_mm)
+        _lay_wires(found, self.base.unroll(points_mm), self.pitch_mm, self.wire_diameter_mm)
+        unit_normals(*found[1:])
+        return found
 
 
 @compiled(error_model="numpy")
-def _lay_wires(
-    distance: FloatArray,
-    slope: FloatArray,
-    hessian: FloatArray,
-    along: FloatArray,
-    along_slope: FloatArray,
-    along_bend: FloatArray,
-    pitch: float,
-    diameter: float,
-) -> None:
+def _lay_wires(base_field: Probe, unrolled: Probe, pitch: float, diameter: float) -> None:
     """Join both families of wires to the base's distance (k,), slope (k, 3) and Hessian (k, 3, 3), in place."""
+    (distance, slope, hessian), (along, along_slope, along_bend) = base_field, unrolled
     radius, blend = diameter / 2, _BLEND * diameter
     base, base_bend, wire = np.empty(3), np.empty((3, 3)), np.empty(3)
     for k in range(len(distance)):

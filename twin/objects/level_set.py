@@ -1,4 +1,6 @@
-"""The base of all signed-distance fields: distance and gradient from one probe, and unit normals of fields that are not exact distances."""
+"""The base of all signed-distance fields: distance, gradient and Hessian from one probe; and unit normals of fields that are not exact
+distances.
+"""
 
 from abc import ABC, abstractmethod
 from typing import TypeAlias
@@ -30,10 +32,6 @@ class ObjectField(ABC):
     def distance(self, points_mm: FloatArray) -> FloatArray:
         """(k,) in mm, positive outside."""
         return self.probe(points_mm)[0]
-
-    def gradient(self, points_mm: FloatArray) -> FloatArray:
-        """(k, 3) unit, outwards."""
-        return self.probe(points_mm)[1]
 
 
 class Wrapped(ObjectField):

@@ -10,8 +10,7 @@ import numpy as np
 from twin.errors import RenderError
 from twin.optics.render import BOUNCES, GelView, Renderer
 from twin.optics.tracer import spectrum
-from twin.optics.variants.arrays import with_room
-from twin.optics.variants.variant import DrJit, use_variant
+from twin.optics.variants.variant import DrJit, use_variant, with_room
 from twin.types import FloatArray, IntArray, PinState
 
 SAMPLES = 32
@@ -66,10 +65,10 @@ class LightModel:
         mi = self._mi
         self._view = GelView(mi, renderer.spec, renderer.window_px, renderer.surfaces(state), BOUNCES)
         self._pixels = mi.UInt32(with_room(pixels, np.uint32))
-        emitters = self._view.tracer.emitters
-        self.led_count = sum(bool(p.half_mm.any()) for p in emitters.patches)
-        self._radiance = [mi.Spectrum(r) for r in emitters.radiance]
-        self._shapes = {shape.id(): mi.ShapePtr(shape) for shape in self._view.tracer.scene.shapes()}
+        tracer = self._view.tracer
+        self.led_count = sum(bool(p.half_mm.any()) for p in tracer.patches)
+        self._radiance = [mi.Spectrum(r) for r in tracer.radiances]
+        self._shapes = {shape.id(): mi.ShapePtr(shape) for shape in tracer.scene.shapes()}
 
     def light(self, knobs: Knobs) -> FloatArray:
         """Light (n, channels) from the gel on the film."""
@@ -104,8 +103,8 @@ class LightModel:
 
         lit = self._radiance[: self.led_count]
         turned = [base * factor(f"led{k}", dr.opaque(mi.Float, float(knobs.leds[k]))) for k, base in enumerate(lit)]
-        tracer.emitters.radiance[:] = [*turned, *self._radiance[self.led_count :]]
-        tracer.tints[:] = []
+        tracer.radiances = [*turned, *self._radiance[self.led_count :]]
+        tracer.tints = []
         for part, shape in self._shapes.items():
             tint = spectrum(mi, getattr(knobs, part))
             dr.make_opaque(tint)

@@ -2,12 +2,13 @@
 
 Skin, stems and caps are projected through the window, shaded with the lamps' direct light (without shadows), and drawn from far to near.
 Pins are drawn with exact coverage of pixels. Shadows, and light that other surfaces reflect, are approximated by a gain and an offset
-for each material; `Preview.calibrate` fits these to a path-traced frame.
+for each material; `Preview.calibrate` fits these to a path-traced frame. A lens with a finite aperture blurs the picture by circles of
+confusion.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Protocol, TypeAlias
+from functools import lru_cache
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -15,24 +16,19 @@ from scipy.optimize import nnls
 from scipy.spatial import Delaunay
 
 from scenes.sensor import GeometrySpec, SensorSpec, ViewSpec
-from twin.camera.projection import project, sensor_to_camera
+from twin.camera.projection import distort, project, sensor_to_camera, window_tangent
+from twin.compiled import compiled
 from twin.errors import RenderError
 from twin.geometry.pins import rest_pins
 from twin.geometry.shapes import shape_of
-from twin.optics.defocus import circles_px, defocused
-from twin.optics.direct_light import DirectLight
-from twin.optics.glass.lens import ray_table
-from twin.optics.glass.window import Window
-from twin.optics.lights import lights
+from twin.optics.direct_light import DirectLight, lights
+from twin.optics.glass import Window, ray_table
 from twin.optics.raster import PinOutlines, draw_pins, draw_triangles, side_normals
 from twin.optics.relief import Relief
 from twin.optics.static_layer import static_layer
 from twin.optics.surfaces import cap_albedo, unit
 from twin.optics.tracer import luminance
 from twin.types import BoolArray, FloatArray, IntArray, PinState
-
-Lamp: TypeAlias = Callable[[FloatArray, FloatArray], FloatArray]
-"""Function that gives the irradiance (n, 3), divided by n^2 of the gel, at points (n, 3) in mm with normals (n, 3)."""
 
 SKIN, STEM, SIDE, FACE = range(4)
 """Indices of the materials: the skin, and a pin's stem, cap side and cap face."""
@@ -48,6 +44,102 @@ NEAR_PX = 4.0
 """Standard deviation, px, of the Gaussian neighbourhood in which traced and rasterised light of the skin are compared."""
 MOST_SKIN_GAIN = 4.0
 """Largest gain of one corner of the skin."""
+LEAST_VARIANCE = 0.03
+"""Variance of the smallest blur that is not interpolated from a sharp picture, px^2: that of a disc of 0.7 px."""
+FINE = 16
+"""Number of points along each side of a pixel at which the coverage of the pixel by a disc is evaluated."""
+HALVINGS = 12
+"""Number of bisection steps in the search of a disc's diameter."""
+
+
+def circles_px(view: ViewSpec, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Circles of confusion of points (n, 3) in the gel.
+
+    A ray through a point o of the pupil has the tangent ``t(o) + o / focus`` at the film, because points at the focus distance are sharp.
+    Away from the axis the rays through the pupil fill an ellipse on the film. Its centre differs from the ray through the pupil's centre.
+
+    Returns
+    -------
+    diameter : (n,) float
+        Root mean square of the ellipse's axes, px.
+    shift : (n, 2) float
+        Shift from the image through the pupil's centre to the mean image over the pupil, px.
+    """
+    camera = view.camera
+    radius = 0.5 * camera.aperture_mm
+    places = radius * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])[:, None]
+    across = points_mm[:, :2] - places
+    rho = np.linalg.norm(across, axis=-1)
+    tangent = across * (window_tangent(view, rho, points_mm[:, 2]) / np.maximum(rho, 1e-12))[..., None]
+    seen = distort(camera, tangent + places / camera.focus_mm) * [camera.fx_px, camera.fy_px]
+    spread = np.stack([seen[1] - seen[2], seen[3] - seen[4]])
+    mean_square = 0.5  # of a radius over a disc, relative to its rim: the shift grows with the square
+    return np.sqrt(0.5 * np.sum(spread**2, axis=(0, 2))), mean_square * (seen[1:].mean(axis=0) - seen[0])
+
+
+def defocused(image: FloatArray, circles: FloatArray) -> FloatArray:
+    """A picture (H, W, C) float32 in which each pixel is blurred by its own circle of confusion, with diameters (H, W) in px.
+
+    The result is interpolated between a few blurred pictures. The interpolation is linear in the variance of the blur, which is 1 / 16 of
+    the squared diameter.
+    """
+    first, last = int(_level(float(circles.min()))), int(np.ceil(_level(float(circles.max()))))
+    if last == 0:
+        return image
+    blurred = [cv2.filter2D(image, -1, disc(LEAST_VARIANCE * 2.0 ** (k - 1))) if k else image for k in range(first, last + 1)]
+    return np.asarray(_interpolate_blur(np.stack([each.reshape(image.shape) for each in blurred]), circles, first))
+
+
+@compiled()
+def _level(diameter_px: float) -> float:
+    """Fractional index of a blur among the blurred pictures. Their variances are 0, and 1, 2, 4, ... times ``LEAST_VARIANCE``."""
+    blur = diameter_px**2 / 16 / LEAST_VARIANCE
+    if blur < 1:
+        return blur
+    above = np.floor(np.log2(blur))
+    return above + blur / 2**above
+
+
+@compiled()
+def _interpolate_blur(blurred: FloatArray, circles: FloatArray, first: int) -> FloatArray:
+    """Picture (H, W, C) whose pixels have the given circles (H, W), from blurred pictures (K, H, W, C) with levels from ``first`` on."""
+    levels, height, width, channels = blurred.shape
+    found = np.empty((height, width, channels), np.float32)
+    for row in range(height):
+        for column in range(width):
+            at = _level(circles[row, column]) - first
+            low = min(int(at), levels - 1)
+            high = min(low + 1, levels - 1)
+            part = at - low
+            for k in range(channels):
+                found[row, column, k] = (1 - part) * blurred[low, row, column, k] + part * blurred[high, row, column, k]
+    return found
+
+
+@lru_cache(maxsize=32)
+def disc(variance: float) -> FloatArray:
+    """Kernel (k, k) of a disc with this variance, px^2, along each axis.
+
+    The coverage of pixels by a disc has another variance than the disc, because a pixel is not a point. Therefore a disc of another size is
+    used.
+    """
+    low, high = 0.0, 4 * np.sqrt(variance) + 1
+    reach = int(np.ceil(0.5 * high))
+    place = np.arange(-reach, reach + 1)
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        too_wide = float(_cover(middle, reach).sum(axis=0) @ place**2) > variance
+        low, high = (low, middle) if too_wide else (middle, high)
+    return _cover(high, reach)
+
+
+def _cover(diameter_px: float, reach: int) -> FloatArray:
+    """Fraction (k, k) of a disc's area in each pixel, up to ``reach`` pixels from the pixel at its centre."""
+    pixels = 2 * reach + 1
+    place = (np.arange(pixels * FINE) + 0.5) / FINE - 0.5 * pixels
+    inside = np.clip(0.5 + FINE * (0.5 * diameter_px - np.hypot(place[:, None], place)), 0, 1)
+    cover = inside.reshape(pixels, FINE, pixels, FINE).sum(axis=(1, 3)).astype(np.float32)
+    return np.asarray(cover / cover.sum())
 
 
 class Renders(Protocol):
@@ -114,9 +206,6 @@ class Preview:
     spec : SensorSpec
     window_px : (x0, y0, x1, y1), optional
         Part of the raw frame, end exclusive; the whole frame by default.
-    light : callable, optional
-        Function that gives the irradiance (n, 3), divided by n^2 of the gel, at points (n, 3) in mm with normals (n, 3); `DirectLight` by
-        default.
     shading : Shading, optional
         By default direct light alone.
     static : (light, cover), optional
@@ -128,7 +217,6 @@ class Preview:
         spec: SensorSpec,
         *,
         window_px: tuple[int, int, int, int] | None = None,
-        light: Lamp | None = None,
         shading: Shading | None = None,
         static: tuple[FloatArray, FloatArray] | None = None,
     ) -> None:
@@ -136,7 +224,6 @@ class Preview:
         self.window_px = window_px or (0, 0, spec.camera.width_px, spec.camera.height_px)
         self._color = spec.camera.channels == "color"
         self._direct = DirectLight(spec.lens, spec.gel, lights(spec.leds, spec.housing))
-        self._light = light or self._direct
         shine, cover = static_layer(spec, self.window_px) if static is None else static
         through = (1 - np.asarray(cover)) * _transmittance(spec.view, self.window_px)
         self._through = through[..., None].astype(np.float32)
@@ -147,15 +234,11 @@ class Preview:
         self._outlines = PinOutlines(spec.view, spec.pins, spec.appearance)
         self._belt_mm, self._faces = _belt(spec.geometry, self._rest.base_mm)
         self._belt_px = project(spec.view, self._belt_mm)
-        self._belt_light = self._light(self._belt_mm, -shape_of(spec.skin).normals(self._belt_mm))
-        self._mean_light = self._cap_light(self._rest.caps_mm, self._rest.axis).mean()
+        self._belt_light = self._direct(self._belt_mm, -shape_of(spec.skin).normals(self._belt_mm))
         look = spec.appearance
-        self._albedo = (
-            np.array([look.skin_albedo]),
-            np.array([look.pin_albedo]),
-            cap_albedo(look, spec.pins.count)[:, None],
-            cap_albedo(look, spec.pins.count),
-        )
+        self._mean_light = self._direct(self._rest.caps_mm, self._rest.axis, look.cap_bump).mean()
+        cap = cap_albedo(look, spec.pins.count)
+        self._albedo = np.array([look.skin_albedo]), np.array([look.pin_albedo]), cap[:, None], cap
 
     def render(self, state: PinState | None = None) -> FloatArray:
         """Linear light on the film, as a `Renderer` gives it.
@@ -237,13 +320,6 @@ class Preview:
         at_corners = cv2.remap(ratio.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0)
         return np.clip(at_corners, 0, MOST_SKIN_GAIN)
 
-    def _cap_light(self, places_mm: FloatArray, normals: FloatArray) -> FloatArray:
-        """Irradiance of caps. With the sensor's own lamps a share of the light (``cap_bump``) is received as by balls."""
-        if self._light is self._direct:
-            return self._direct(places_mm, normals, self.spec.appearance.cap_bump)
-        each = np.broadcast_to(places_mm.reshape(len(places_mm), *[1] * (normals.ndim - 2), 3), normals.shape)
-        return self._light(each.reshape(-1, 3), normals.reshape(-1, 3)).reshape(normals.shape)
-
     def _drawing(self, state: PinState) -> _Drawing:
         base, axis, caps = state.base_mm, state.axis, state.caps_mm
         if base.shape != self._rest.base_mm.shape:
@@ -253,8 +329,8 @@ class Preview:
         half = 0.5 * self.spec.pins.cap_height_mm
         places = [base, 0.5 * (base + caps), caps, caps + half * axis]
         side = toward - np.sum(toward * axis, axis=1, keepdims=True) * axis
-        lit = [self._light(place, normal) for place, normal in zip(places[:2], (axis, unit(side)), strict=True)]
-        lit += [self._cap_light(place, normal) for place, normal in zip(places[2:], (side_normals(axis), axis), strict=True)]
+        normals, bump = (axis, unit(side), side_normals(axis), axis), self.spec.appearance.cap_bump
+        lit = [self._direct(*each) for each in zip(places, normals, (0.0, 0.0, bump, bump), strict=True)]
         skin = np.concatenate([base, self._belt_mm])
         kept = [self._gel_transmittance(place, pupil) for place in (skin, *places[1:])]
         kept[SIDE] = kept[SIDE][:, None]
@@ -277,7 +353,7 @@ class Preview:
             self._on_film(albedo / np.pi * (gain * direct + more * ambient)) for albedo, gain, direct, more, ambient in parts
         )
         draw_triangles(image, drawing.corners_px, skin * shading.skin.astype(np.float32), self._faces)
-        draw_pins(image, drawing.outlines_px, stem, side, face, drawing.facing, drawing.far_first)
+        draw_pins(image, drawing.outlines_px, (stem, side, face), drawing.facing, drawing.far_first)
         if drawing.circles is None:
             return image
         circles = np.zeros((*image.shape[:2], 1), np.float32)
@@ -320,4 +396,4 @@ def _transmittance(view: ViewSpec, window_px: tuple[int, int, int, int]) -> Floa
     corners = (ray_table(view.camera, window_px) @ sensor_to_camera(view.camera)[:3, :3])[..., 2]
     cos_air = np.clip(0.25 * (corners[:-1, :-1] + corners[1:, :-1] + corners[:-1, 1:] + corners[1:, 1:]), 1e-6, 1)
     cos_window, cos_gel = (np.sqrt(1 - (1 - cos_air**2) / n**2) for n in (view.lens.refractive_index, view.gel_index))
-    return Window.of(view).transmittance(np, cos_air, cos_window, cos_gel)
+    return Window(view).transmittance(np, cos_air, cos_window, cos_gel)

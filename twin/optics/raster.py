@@ -88,13 +88,7 @@ def _hull(near: FloatArray, far: FloatArray) -> FloatArray:
 
 @compiled(error_model="numpy")
 def draw_pins(
-    image: FloatArray,
-    outlines: FloatArray,
-    stem_light: FloatArray,
-    side_light: FloatArray,
-    face_light: FloatArray,
-    facing: BoolArray,
-    order: IntArray,
+    image: FloatArray, outlines: FloatArray, lights: tuple[FloatArray, FloatArray, FloatArray], facing: BoolArray, order: IntArray
 ) -> None:
     """Draw stems and caps over the image, pin by pin. Each pixel gets the light of each facet by the share of its area that this covers.
 
@@ -106,16 +100,15 @@ def draw_pins(
     image : (H, W, C) float
     outlines : (N, 4, K, 2) float
         Closed outlines (`PinOutlines`), px.
-    stem_light, face_light : (N, C) float
-    side_light : (N, 2 K, C) float
-        Of the wall's facets, then of the bevel's. Facet k lies between the corners k and k + 1.
+    lights : ((N, C), (N, 2 K, C), (N, C)) float
+        Of the stem; of the wall's facets, then of the bevel's; and of the face. Facet k lies between the corners k and k + 1.
     facing : (N,) bool
         Whether the camera sees the cap's face. Otherwise the black inside of the cap is drawn, where its wall does not hide it.
     order : (N,) int
         Numbers of the pins in the order of drawing.
     """
     height, width, channels = image.shape
-    sides = outlines.shape[2]
+    sides, (stem_light, side_light, face_light) = outlines.shape[2], lights
     quad, black = np.empty((4, 2)), np.zeros(channels)
     for p in order:
         for body in range(2):

@@ -15,9 +15,8 @@ from twin.camera.projection import project
 from twin.compiled import compiled
 from twin.errors import FrameError, RenderError
 from twin.geometry.pins import across_axis
-from twin.optics.direct_light import DirectLight
-from twin.optics.lights import lights
-from twin.optics.measured import values_of
+from twin.optics.direct_light import DirectLight, lights
+from twin.optics.static_layer import values_of
 from twin.optics.surfaces import cap_albedo
 from twin.types import FloatArray, IntArray, PinState
 

@@ -11,8 +11,7 @@ from scenes.sensor import SensorSpec
 from twin.errors import RenderError
 from twin.geometry.mesh import SensorMesh
 from twin.geometry.pins import rest_pins
-from twin.optics.glass.lens import CameraRays
-from twin.optics.glass.window import Window
+from twin.optics.glass import CameraRays, Window
 from twin.optics.preview import Preview, Shading
 from twin.optics.relief import Relief
 from twin.optics.sampling import SKIN_SAVING, PixelSamples, near_pins
@@ -21,15 +20,14 @@ from twin.optics.scene import build_scene, move_meshes
 from twin.optics.static_layer import static_layer
 from twin.optics.surfaces import PaintedSurface, SkinSurface, caps, stems
 from twin.optics.tracer import GelTracer, luminance
-from twin.optics.variants.arrays import with_room
-from twin.optics.variants.variant import DrJit, VariantChoice, choose_variant, use_variant
+from twin.optics.variants.variant import DrJit, VariantChoice, choose_variant, use_variant, with_room
 from twin.store import cached_arrays, write_bytes
 from twin.types import FloatArray, IntArray, PinState, Quality
 
 SAMPLES = {"rasterised": 0, "preview": 4, "standard": 16, "high": 64}
 """Number of samples per pixel, by quality."""
-SCALAR_SAMPLES = {"rasterised": 0, "preview": 1, "standard": 4, "high": 16}
-"""Number of samples per pixel of the scalar variant, which is several times slower."""
+SCALAR_SAVING = 4
+"""Ratio of these to the samples of the scalar variant, which is several times slower."""
 SHADING_QUALITY: Quality = "standard"
 """Quality of the path-traced frame to which a stored shading is fitted."""
 BOUNCES = 2
@@ -91,12 +89,12 @@ class Renderer:
         if not (0 <= x0 < x1 <= camera.width_px and 0 <= y0 < y1 <= camera.height_px):
             raise RenderError(f"window_px={window} must lie within the {camera.width_px} x {camera.height_px} px frame, end exclusive")
         self.spec = spec
-        self.window_px = window
+        self.window_px = x0, y0, x1, y1
         self.drawn = quality == "rasterised"
         if self.drawn and spp:
             raise RenderError(f"spp={spp}: a rasterised picture has no samples; use another quality, or leave spp out")
         self._variant, self._shading = variant, shading
-        self.spp = 0 if self.drawn else spp or (SCALAR_SAMPLES if self.choice.backend == "scalar" else SAMPLES)[quality]
+        self.spp = 0 if self.drawn else spp or SAMPLES[quality] // (SCALAR_SAVING if self.choice.backend == "scalar" else 1)
         self._rest = rest_pins(spec.geometry)
         self._mesh, self._inner = mesh, None if mesh is None else np.unique(mesh.inner_quads)
         usual = BRIGHT_SKIN_BOUNCES if spec.appearance.dark_caps else BOUNCES
@@ -179,7 +177,7 @@ class Renderer:
             kind: type[GelView] | type[ScalarView] = ScalarView if self.choice.backend == "scalar" else GelView
             self._view = kind(mi, self.spec, self.window_px, surfaces, self._bounces)
         else:
-            self._view.move(surfaces)
+            move_meshes(self._view.params, surfaces)
         light, through = self.static
         pixels = np.flatnonzero(through > 0)
         known = light.copy()
@@ -227,8 +225,7 @@ def traced_shading(preview: Preview) -> Shading:
     """
 
     def trace() -> dict[str, np.ndarray]:
-        shading = preview.calibrate(Renderer(preview.spec, quality=SHADING_QUALITY, window_px=preview.window_px))
-        return {"gain": shading.gain, "offset": shading.offset, "skin": shading.skin}
+        return vars(preview.calibrate(Renderer(preview.spec, quality=SHADING_QUALITY, window_px=preview.window_px)))
 
     key = {"sensor": preview.spec.model_dump(mode="json"), "window_px": list(preview.window_px), "quality": SHADING_QUALITY}
     return Shading(**cached_arrays("shading", key, trace, code=(Preview, Renderer)))
@@ -256,12 +253,8 @@ class GelView:
         self._mi, self._dr, self._spec, self._window_px = mi, dr, spec, window_px
         scene = build_scene(mi, spec.appearance, spec.gel.refractive_index, surfaces)
         self.params = mi.traverse(scene)
-        self.tracer = GelTracer.of(mi, spec, scene, bounces)
-        self.rays = CameraRays(mi, dr, spec.camera, Window.of(spec.view), window_px)
-
-    def move(self, surfaces: dict[str, PaintedSurface]) -> None:
-        """Move the meshes' vertices."""
-        move_meshes(self.params, surfaces)
+        self.tracer = GelTracer(mi, spec, scene, bounces)
+        self.rays = CameraRays(mi, dr, spec.camera, Window(spec.view), window_px)
 
     def gel_light(self, pixels: IntArray, spp: int, seed: int, state: PinState) -> FloatArray:
         """Mean light (n, 3) or (n, 1) of pixels (n,) of the window, numbered row by row. Bare skin gets fewer samples."""

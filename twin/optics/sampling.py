@@ -4,6 +4,7 @@ Pixels that show pins need many samples, because edges are noisy. Dark bare skin
 because pins shadow it.
 """
 
+from copy import copy
 from types import ModuleType
 
 import cv2
@@ -84,8 +85,7 @@ class PixelSamples:
 
     def of(self, chosen: DrJit) -> "PixelSamples":
         """The remaining random numbers of some of the samples."""
-        part = PixelSamples.__new__(PixelSamples)
-        part.__dict__.update(self.__dict__)
+        part = copy(self)
         part._pixel, part._index = (self._dr.gather(self._mi.UInt32, values, chosen) for values in (self._pixel, self._index))
         return part
 

@@ -15,8 +15,8 @@ from scipy.ndimage import map_coordinates
 from scenes.sensor import SensorSpec, ViewSpec
 from twin.camera.projection import pixel_rays, project, window_tangent
 from twin.geometry.pins import rest_pins
-from twin.optics.lights import Patch, lights
-from twin.optics.scene import build_pinhole_camera, build_scene, mesh, move_meshes
+from twin.optics.direct_light import Patch, lights
+from twin.optics.scene import build_pinhole_camera, build_scene, mesh
 from twin.optics.surfaces import PaintedSurface
 from twin.optics.variants.variant import DrJit
 from twin.types import FloatArray, IntArray, PinState
@@ -41,17 +41,13 @@ class ScalarView:
         emitters = _apparent_lights(mi, self._view, lights(spec.leds, spec.housing), rest_mm)
         integrator = {"type": "path", "max_depth": bounces + 2, "rr_depth": 100}
         self._scene = build_scene(mi, spec.appearance, spec.gel.refractive_index, surfaces, extra=emitters | {"integrator": integrator})
-        self._params = mi.traverse(self._scene)
+        self.params = mi.traverse(self._scene)
         place, direction = pixel_rays(self._view, rest_px)
         self._eye_mm = np.array([0.0, 0.0, nearest_point(place, direction)[2]])
         across = rest_mm - self._eye_mm
         self._half_field = 1.25 * float(np.abs(across[:, :2] / across[:, 2:]).max())
         pitch_px = np.ptp(rest_px, axis=0).max()
         self._size = int(OVERSAMPLING * 1.25 * pitch_px)
-
-    def move(self, surfaces: dict[str, PaintedSurface]) -> None:
-        """Move the meshes' vertices."""
-        move_meshes(self._params, surfaces)
 
     def gel_light(self, pixels: IntArray, spp: int, seed: int, state: PinState) -> FloatArray:
         """Mean light (n, channels) of the given pixels (n,) of the window, numbered row by row."""
@@ -103,9 +99,8 @@ def _apparent_lights(mi: ModuleType, view: ViewSpec, patches: Sequence[Patch], c
         flat = away[:, 2] / np.sqrt(dist2) / dist2  # solid angle per area of the square in the gel
         radiance = patch.radiance * float(np.median(gain / np.maximum(flat, 1e-9)))
         emitter = mi.load_dict({"type": "area", "radiance": {"type": "rgb", "value": [float(c) for c in radiance]}})
-        made[f"led{k}"] = mesh(
-            mi, f"led{k}", PaintedSurface(corners, np.array([[0, 1, 2], [0, 2, 3]])), unseen, smooth=False, emitter=emitter
-        )
+        surface = PaintedSurface(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+        made[f"led{k}"] = mesh(mi, f"led{k}", surface, unseen, smooth=False, emitter=emitter)
     return made
 
 

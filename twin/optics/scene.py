@@ -8,8 +8,7 @@ import numpy as np
 from scenes.sensor import AppearanceSpec
 from twin.optics.surfaces import PaintedSurface, vertex_normals
 from twin.optics.tracer import luminance
-from twin.optics.variants.arrays import with_room
-from twin.optics.variants.variant import DrJit
+from twin.optics.variants.variant import DrJit, with_room
 from twin.types import FloatArray
 
 # Refractive index of the skin and the caps (acrylate rubber).
@@ -37,16 +36,12 @@ def build_scene(
     mi.Scene
         Its updatable meshes have the ids ``skin``, ``stems`` and ``caps``.
     """
-    skin_bsdf = _rubber(mi, {"type": "rgb", "value": list(look.skin_albedo)}, look.skin_gloss, look.skin_roughness, gel_index)
-    cap_bsdf = _rubber(mi, PAINT, look.cap_gloss, look.cap_roughness, gel_index)
-    description = {
-        "type": "scene",
-        "skin": mesh(mi, "skin", surfaces["skin"], skin_bsdf, smooth=True),
-        "stems": mesh(
-            mi, "stems", surfaces["stems"], _rubber(mi, {"type": "rgb", "value": list(look.pin_albedo)}, 0.0, 1.0, gel_index), smooth=True
-        ),
-        "caps": mesh(mi, "caps", surfaces["caps"], cap_bsdf, smooth=False),
-    }
+    skin = _rubber(mi, {"type": "rgb", "value": list(look.skin_albedo)}, look.skin_gloss, look.skin_roughness, gel_index)
+    stem = _rubber(mi, {"type": "rgb", "value": list(look.pin_albedo)}, 0.0, 1.0, gel_index)
+    cap = _rubber(mi, PAINT, look.cap_gloss, look.cap_roughness, gel_index)
+    description = {"type": "scene"}
+    for name, bsdf, smooth in (("skin", skin, True), ("stems", stem, True), ("caps", cap, False)):
+        description[name] = mesh(mi, name, surfaces[name], bsdf, smooth=smooth)
     return mi.load_dict(description | (extra or {}), parallel=False)
 
 
@@ -57,19 +52,17 @@ def build_pinhole_camera(mi: ModuleType, to_world: FloatArray, half_field: float
     ``((i + 0.5) / size_px * 2 - 1) * half_field``, and along y the same with j.
     """
     film = {"type": "hdrfilm", "width": size_px, "height": size_px, "rfilter": {"type": "box"}, "component_format": "float32"}
-    return mi.load_dict(
-        {
-            "type": "perspective",
-            "fov": float(np.degrees(2 * np.arctan(half_field))),
-            "near_clip": 0.01,
-            "far_clip": 1e4,
-            "to_world": mi.ScalarTransform4f(
-                to_world @ np.diag([-1.0, -1.0, 1.0, 1.0])
-            ),  # Mitsuba's image x and y have the opposite directions of its camera's x and y
-            "film": film | {"pixel_format": "luminance" if mi.variant().endswith("mono") else "rgb"},
-            "sampler": {"type": "multijitter", "sample_count": spp},
-        }
-    )
+    camera = {
+        "type": "perspective",
+        "fov": float(np.degrees(2 * np.arctan(half_field))),
+        "near_clip": 0.01,
+        "far_clip": 1e4,
+        # Mitsuba's image x and y have the opposite directions of its camera's x and y
+        "to_world": mi.ScalarTransform4f(to_world @ np.diag([-1.0, -1.0, 1.0, 1.0])),
+        "film": film | {"pixel_format": "luminance" if mi.variant().endswith("mono") else "rgb"},
+        "sampler": {"type": "multijitter", "sample_count": spp},
+    }
+    return mi.load_dict(camera)
 
 
 def mesh(mi: ModuleType, name: str, surface: PaintedSurface, bsdf: DrJit, *, smooth: bool, emitter: DrJit | None = None) -> DrJit:
@@ -116,13 +109,5 @@ def _rubber(mi: ModuleType, reflectance: Mapping[str, object], gloss: float, rou
     """A matt material with a rough specular lobe of weight ``gloss`` at its boundary to the gel."""
     if gloss == 0:
         return mi.load_dict({"type": "diffuse", "reflectance": reflectance})
-    return mi.load_dict(
-        {
-            "type": "roughplastic",
-            "diffuse_reflectance": reflectance,
-            "specular_reflectance": gloss,
-            "int_ior": SKIN_INDEX,
-            "ext_ior": gel_index,
-            "alpha": roughness,
-        }
-    )
+    boundary = {"int_ior": SKIN_INDEX, "ext_ior": gel_index, "alpha": roughness}
+    return mi.load_dict({"type": "roughplastic", "diffuse_reflectance": reflectance, "specular_reflectance": gloss} | boundary)

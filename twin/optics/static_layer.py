@@ -1,8 +1,10 @@
 """The static layer: everything that the camera sees besides the gel. This is the housing, the LEDs' reflections, and specks.
 
-Contacts do not change this layer. It is computed once, without noise.
+Contacts do not change this layer. It is computed once, without noise. Pictures of measured signed values (`values_of`) hold red, green and
+blue as 8-bit levels that are fine near zero.
 """
 
+import base64
 from collections.abc import Sequence
 from functools import lru_cache, partial
 
@@ -12,12 +14,15 @@ from scipy.ndimage import map_coordinates
 
 from scenes.sensor import HousingSpec, LedRingSpec, SensorSpec, SpeckSpec, ViewSpec
 from twin.camera.projection import sensor_to_camera
-from twin.optics.glass.lens import ray_table, subpixel_rays
-from twin.optics.glass.window import fresnel
-from twin.optics.lights import Patch, led_patches, lights
-from twin.optics.measured import values_of
+from twin.errors import FrameError
+from twin.optics.direct_light import Patch, led_patches, lights
+from twin.optics.glass import fresnel, ray_table, subpixel_rays
 from twin.types import FloatArray
 
+MIDDLE, STEPS = 128, 127
+"""Level of the value 0, and number of levels on either side."""
+QUALITY = 97
+"""JPEG quality of a written picture. Its errors are below those of the measured values."""
 ACROSS = 4
 """Number of places along each side of a pixel at which the layer is evaluated if the pixel's corners differ."""
 EVEN = 0.02
@@ -30,6 +35,34 @@ KEPT = 4
 """Number of layers in memory: those of the frame and of a window of it, before and after a change."""
 SMALL = 1e-3
 """Smallest reference for the relative difference of light or cover within a pixel. Smaller values need no relative precision."""
+
+
+def picture_of(values: FloatArray, span: float, power: float) -> str:
+    """The data URI of values (H, W, 3), clipped to +-span. Level v stands for ``sign(v - 128) span (|v - 128| / 127)^power``."""
+    share = np.minimum(np.abs(values) / span, 1) ** (1 / power)
+    levels = np.rint(MIDDLE + STEPS * np.sign(values) * share).astype(np.uint8)
+    options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    _, content = cv2.imencode(".jpg", np.ascontiguousarray(levels[..., ::-1]), options)
+    return f"data:image/jpeg;base64,{base64.b64encode(content.tobytes()).decode('ascii')}"
+
+
+def values_of(picture: str, span: float, power: float, what: str) -> FloatArray:
+    """The values (H, W, 3) of a picture (see `picture_of`).
+
+    Raises
+    ------
+    FrameError
+        It is no picture; the message begins with ``what``.
+    """
+    try:
+        content = np.frombuffer(base64.b64decode(picture.partition(",")[2], validate=True), np.uint8)
+    except ValueError:
+        content = np.zeros(0, np.uint8)
+    decoded = cv2.imdecode(content, cv2.IMREAD_COLOR) if len(content) else None
+    if decoded is None:
+        raise FrameError(f"{what}: the picture can't be decoded; give the whole content of a PNG, JPEG or WebP file")
+    share = (decoded[..., ::-1].astype(np.float32) - MIDDLE) / STEPS
+    return np.asarray(np.sign(share) * np.abs(share) ** np.float32(power) * np.float32(span), np.float32)
 
 
 def static_layer(spec: SensorSpec, window_px: tuple[int, int, int, int]) -> tuple[FloatArray, FloatArray]:
@@ -114,9 +147,8 @@ def rim_light(ring: HousingSpec, at_mm: FloatArray) -> FloatArray:
     inside = (along >= 0) & (along <= table.shape[1] - 1)
     light = np.zeros((*turn.shape, 3))
     round_table = np.concatenate([table, table[:1]])
-    light[inside] = np.stack(
-        [map_coordinates(round_table[..., k], [turn[inside], along[inside]], order=1, mode="nearest") for k in range(3)], axis=-1
-    )
+    at = turn[inside], along[inside]
+    light[inside] = np.stack([map_coordinates(round_table[..., k], at, order=1, mode="nearest") for k in range(3)], axis=-1)
     return light
 
 

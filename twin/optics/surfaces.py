@@ -92,9 +92,8 @@ def caps(pins: PinsSpec, appearance: AppearanceSpec, caps_mm: FloatArray, axis: 
     radius *= np.sqrt(2 * np.pi / CAP_SIDES / np.sin(2 * np.pi / CAP_SIDES))  # the polygon has the disc's area
     profile = np.array([[radius, -half], [radius, half - bevel], [radius - bevel, half], [0, half]])
     body = lathe(profile, caps_mm, axis, CAP_SIDES, cap_outlines(appearance, CAP_SIDES))
-    return PaintedSurface(
-        body.vertices_mm, body.faces, np.repeat(cap_albedo(appearance, pins.count), len(body.vertices_mm) // len(caps_mm), axis=0)
-    )
+    paint = np.repeat(cap_albedo(appearance, pins.count), len(body.vertices_mm) // len(caps_mm), axis=0)
+    return PaintedSurface(body.vertices_mm, body.faces, paint)
 
 
 def cap_albedo(look: AppearanceSpec, count: int) -> FloatArray:

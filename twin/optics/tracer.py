@@ -5,14 +5,13 @@ probability proportional to its light and tested for a shadow. If there is no sh
 towards the window are reflected by it (including total reflection) or lost in the housing.
 """
 
-from dataclasses import dataclass, field
 from types import ModuleType
 
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.optics.glass.window import Window
-from twin.optics.lights import Patch, lights
+from twin.optics.direct_light import Patch, lights
+from twin.optics.glass import Window
 from twin.optics.sampling import PixelSamples
 from twin.optics.variants.variant import DrJit
 from twin.types import FloatArray
@@ -25,15 +24,6 @@ NEVER = 1e-12
 """Threshold below which a probability counts as 0."""
 
 
-@dataclass(frozen=True)
-class Emitters:
-    """Patches as arrays for Dr.Jit. Radiances are spectra of Dr.Jit, so that they can have gradients."""
-
-    patches: list[Patch]
-    radiance: list[DrJit]
-
-
-@dataclass
 class GelTracer:
     """Light that arrives at the camera's side of the window along rays in the gel.
 
@@ -42,33 +32,21 @@ class GelTracer:
     scene : mi.Scene
         Skin, stems and caps, without lights.
     window : Window
-    emitters : Emitters
-    absorption : tuple of float
-        Beer-Lambert coefficients, 1/mm.
+    patches, radiances : list of Patch, list of mi.Spectrum
+        The lights; their radiances can have gradients.
     bounces : int
         Number of scatterings of a path after its first vertex.
-    bump : float
-        ``AppearanceSpec.cap_bump`` of the shape ``caps``.
     tints : list of (mi.ShapePtr, mi.Spectrum)
         Factors on the reflectances of shapes; they can have gradients.
     """
 
-    scene: DrJit
-    window: Window
-    emitters: Emitters
-    absorption: tuple[float, float, float]
-    bounces: int
-    bump: float
-    caps: DrJit
-    tints: list[tuple[DrJit, DrJit]] = field(default_factory=list)
-
-    @classmethod
-    def of(cls, mi: ModuleType, spec: SensorSpec, scene: DrJit, bounces: int) -> "GelTracer":
-        """The tracer of a sensor, from its scene in the gel and a number of bounces."""
-        patches = lights(spec.leds, spec.housing)
-        emitters = Emitters(patches, [spectrum(mi, p.radiance) for p in patches])
-        caps = next(mi.ShapePtr(shape) for shape in scene.shapes() if shape.id() == "caps")
-        return cls(scene, Window.of(spec.view), emitters, spec.gel.absorption_per_mm, bounces, spec.appearance.cap_bump, caps)
+    def __init__(self, mi: ModuleType, spec: SensorSpec, scene: DrJit, bounces: int) -> None:
+        self.scene, self.window, self.bounces = scene, Window(spec.view), bounces
+        self.patches = lights(spec.leds, spec.housing)
+        self.radiances = [spectrum(mi, p.radiance) for p in self.patches]
+        self._absorption, self._bump = spec.gel.absorption_per_mm, spec.appearance.cap_bump
+        self._caps = next(mi.ShapePtr(shape) for shape in scene.shapes() if shape.id() == "caps")
+        self.tints: list[tuple[DrJit, DrJit]] = []
 
     def radiance(self, mi: ModuleType, dr: ModuleType, place: DrJit, direction: DrJit, random: PixelSamples) -> DrJit:
         """Radiance in the gel, divided by n^2, along rays that start on the window's gel side.
@@ -134,8 +112,8 @@ class GelTracer:
         """Reflected radiance of the patches' light at a vertex."""
         place, ways, shares = random.next_2d(), [], []
         total = mi.Float(0.0)
-        bump = dr.select(hit.shape == self.caps, self.bump, 0.0)
-        for patch, radiance in zip(self.emitters.patches, self.emitters.radiance, strict=True):
+        bump = dr.select(hit.shape == self._caps, self._bump, 0.0)
+        for patch, radiance in zip(self.patches, self.radiances, strict=True):
             toward, length, factor = self.window.connect(dr, mi, hit.p, _point(mi, dr, patch, place))
             ways.append((toward, length, factor * patch.area_mm2 * radiance))
             taken = _received_share(dr, dr.dot(toward, hit.sh_frame.n), bump)
@@ -167,9 +145,9 @@ class GelTracer:
         return factor
 
     def _transmittance(self, mi: ModuleType, dr: ModuleType, length: DrJit, active: DrJit) -> DrJit:
-        if not any(self.absorption):
+        if not any(self._absorption):
             return mi.Spectrum(1.0)
-        return dr.exp(-spectrum(mi, np.array(self.absorption)) * dr.select(active, length, 0.0))
+        return dr.exp(-spectrum(mi, np.array(self._absorption)) * dr.select(active, length, 0.0))
 
 
 def _received_share(dr: ModuleType, cosine: DrJit, bump: DrJit) -> DrJit:

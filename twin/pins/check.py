@@ -23,7 +23,7 @@ from twin.pins.detectors.tune import other_layout
 from twin.pins.finding.caps import Caps, measure_caps
 from twin.pins.labelling.identify import score_layout
 from twin.pins.labelling.reference import Reference, nominal_reference, project_rest
-from twin.pins.labelling.view import MOST_STRETCH, view_of
+from twin.pins.labelling.view import DECIDES, MOST_STRETCH, UNDECIDED, view_of
 from twin.pins.pipeline import Pipeline
 from twin.progress import Step, report_each, unheard
 from twin.types import Form, Frame, Observation
@@ -85,11 +85,12 @@ CHECKS = {
 
 
 class Grade(StrEnum):
-    """Grade of a finding."""
+    """Grade of a finding; unsure if the frames do not show what it is about."""
 
     HEALTHY = "healthy"
     DEGRADED = "degraded"
     FAILED = "failed"
+    UNSURE = "unsure"
 
 
 @dataclass(frozen=True)
@@ -280,13 +281,13 @@ def _place(seen: list[Observation], nominal: Reference, spec: SensorSpec) -> lis
     turn = view.turn_deg if view.sure else turn
     grown = f" ({seen_scale:.3f} with the bulge of the contact)" if seen_scale - scale > TOLD_BULGE else ""
     away = float(np.linalg.norm(shift))
-    mirror = "the picture is mirrored" if view.mirrored else "the picture is not mirrored" if view.sure else view.describe_ambiguity()
+    mirror = _finding("mirror", float(view.mirrored), f"the picture is {'' if view.mirrored else 'not '}mirrored")
     return [
         _finding("shift", away / pitch, f"displaced by ({shift[0]:.1f}, {shift[1]:.1f}) px, {away / pitch:.2f} pitches"),
         _finding("turn", abs(turn), f"turned by {turn:.2f} deg"),
         _finding("scale", abs(scale - 1), f"{scale:.3f} times its calibrated size{grown}"),
-        _finding("stretch", view.stretch, f"stretched by {view.stretch:.1%}"),
-        _finding("mirror", float(view.mirrored), mirror),
+        _finding("stretch", view.stretch, f"stretched by {100 * view.stretch:.1f} %"),
+        mirror if view.mirrored or view.sure else Finding("mirror", Grade.UNSURE, np.nan, UNDECIDED, DECIDES),
     ]
 
 

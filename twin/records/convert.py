@@ -1,7 +1,7 @@
 """Translates records from any format into any other, and keeps a record in further formats while it is being made."""
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -15,9 +15,9 @@ from twin.frames.forms import frame_size, times
 from twin.frames.lerobot import RESTS
 from twin.pins.pipeline import Pipeline, measure_reference
 from twin.progress import Progress, silent, stage
-from twin.records.folder import HELD_STEPS, SIDECAR, FolderWriter, format_of
+from twin.records.folder import SIDECAR, FolderWriter, format_of
 from twin.records.huggingface import HuggingFaceWriter, huggingface_records
-from twin.records.lerobot import DATA_MB, INFO, LeRobotWriter, lerobot_records
+from twin.records.lerobot import INFO, LeRobotWriter, lerobot_records
 from twin.records.record import About, Episode, RecordError, Records, RecordStep, is_pins
 from twin.records.recording import RecordingWriter, recording_records
 from twin.records.ros2 import Ros2Writer, ros2_records
@@ -87,10 +87,8 @@ def with_pins(records: Records, spec: SensorSpec | None = None) -> Records:
             _require_pins_of(spec, records.about)
         return records
     if spec is None:
-        try:
+        with suppress(SpecError):
             spec = load_sensor(records.about.sensor) if records.about.sensor else None
-        except SpecError:
-            spec = None
     if spec is None:
         note = "no pins: the record does not name a known sensor; give `sensor`, so that its pins are detected"
         return replace(records, notes=[*records.notes, note])
@@ -131,10 +129,8 @@ def open_writer(folder: Path, to: str, about: About, rate_hz: int, *, video: boo
     ----------
     to : str
         One of ``FORMATS``.
-    video : bool
-        Store LeRobot's pictures as video, which loses detail.
-    at_once : bool
-        Finish a file for each episode instead of larger files, so that an episode is safe as soon as it is written.
+    video, at_once : bool
+        As for ``FolderWriter``.
 
     Raises
     ------
@@ -143,16 +139,12 @@ def open_writer(folder: Path, to: str, about: About, rate_hz: int, *, video: boo
     """
     if to not in FORMATS:
         raise RecordError(f"no format {quote(to)}; there are {', '.join(FORMATS)}")
-    if video and to != LeRobotWriter.FORMAT:
+    writer = WRITERS[to]
+    if video and not writer.VIDEOS:
         raise RecordError(f"`video` is an option of the format {LeRobotWriter.FORMAT}; {to} stores pictures without loss; leave it out")
-    if len(about.views) > 1 and to not in (LeRobotWriter.FORMAT, Ros2Writer.FORMAT):
+    if len(about.views) > 1 and not writer.VIEWS:
         raise RecordError(f"{to} has one picture in a step, this record has {len(about.views)}; give lerobot or mcap, or one session of it")
-    if to == LeRobotWriter.FORMAT:
-        return LeRobotWriter(folder, about, rate_hz, video=video, held_mb=0.0 if at_once else DATA_MB)
-    if to == Ros2Writer.FORMAT:
-        return Ros2Writer(folder, about, rate_hz)
-    pictures = HuggingFaceWriter if to == HuggingFaceWriter.FORMAT else RecordingWriter
-    return pictures(folder, about, rate_hz, held_steps=0 if at_once else HELD_STEPS)
+    return writer(folder, about, rate_hz, video=video, at_once=at_once)
 
 
 @dataclass(frozen=True, repr=False)
@@ -254,7 +246,7 @@ def _missing(opened: Sequence[Records], writer: FolderWriter, done: Callable[[in
         done(number)
 
 
-class KeptAlso:
+class KeptAlso(AbstractContextManager["KeptAlso"]):
     """Keeps a growing record in further formats, each in its own subfolder. A context manager.
 
     The record itself is always complete. If the process is killed, the missing episodes of the other formats are written when the same
@@ -285,9 +277,6 @@ class KeptAlso:
                 library(needed)
         self._writers: list[FolderWriter] = []
         self._open = ExitStack()
-
-    def __enter__(self) -> "KeptAlso":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._open.close()

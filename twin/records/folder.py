@@ -10,18 +10,17 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from typing import Any, ClassVar, Self
 
 import cv2
 import numpy as np
 
 from scenes.files import quote, read_regular
-from twin.errors import ErrorsAs, FrameError, library
+from twin.errors import ErrorsAs, FrameError, TwinError, library
 from twin.frames.images import png, read_image
 from twin.frames.lerobot import RESTS
-from twin.records.record import About, Episode, RecordError, Records, RecordStep, digest
-from twin.store import contents, output, write_bytes, write_json
+from twin.records.record import About, Episode, RecordError, Records, RecordStep, channel_of, digest
+from twin.store import contents, output, write_bytes, write_json, write_with
 from twin.types import ImageArray
 
 SIDECAR = "tactip.json"
@@ -46,6 +45,10 @@ class FolderWriter(ABC):
     about : About
     rate_hz : int
         Whole number of frames per second, for formats that state one. A record that is continued keeps its own number.
+    video : bool
+        Store pictures as video, which loses detail, in a format that has ``VIDEOS``.
+    at_once : bool
+        Finish a file for each episode instead of larger files, so that an episode is safe as soon as it is written.
 
     Raises
     ------
@@ -59,12 +62,17 @@ class FolderWriter(ABC):
     NAMES: ClassVar[tuple[str, ...]]  # of everything that is written directly in the folder, besides the description
     FOLDERS: ClassVar[tuple[str, ...]] = ()  # subfolders that exist from the beginning
     LIBRARIES: ClassVar[tuple[str, ...]] = ()  # optional libraries that the format needs
+    VIEWS, VIDEOS = False, False  # whether a step may have several pictures, and whether pictures may be stored as video
 
-    def __init__(self, folder: Path, about: About, rate_hz: int) -> None:
-        self.folder, self.about, self.rate_hz = folder, about, rate_hz
+    def __init__(self, folder: Path, about: About, rate_hz: int, *, video: bool = False, at_once: bool = False) -> None:
+        self.folder, self.about, self.rate_hz, self.video, self.at_once = folder, about, rate_hz, video, at_once
         self.facts: list[dict[str, Any]] = []  # of the episodes in the folder
-        self.keys: set[str] = set()
         self._held = ExitStack()
+
+    @property
+    def keys(self) -> set[str]:
+        """Keys of the episodes in the folder."""
+        return {facts["key"] for facts in self.facts}
 
     def __enter__(self) -> Self:
         for name in self.LIBRARIES:
@@ -82,7 +90,7 @@ class FolderWriter(ABC):
             self._held = held.pop_all()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self._held.close()
 
     def write(self, episodes: Iterator[Episode]) -> int:
@@ -90,7 +98,6 @@ class FolderWriter(ABC):
         before = len(self.facts)
         for group in self._groups(episodes):
             self.facts += group
-            self.keys |= {facts["key"] for facts in group}
         return len(self.facts) - before
 
     def notes(self) -> list[str]:
@@ -119,7 +126,6 @@ class FolderWriter(ABC):
             raise RecordError(f"{self.folder}: the new episodes do not fit those in it ({'; '.join(wrong)}); give another `out`")
         self.about, self.rate_hz = about, int(stored["rate_hz"])
         self.facts = self._find()
-        self.keys = {facts["key"] for facts in self.facts}
 
     def _facts(self, episode: Episode, length: int) -> dict[str, Any]:
         """Facts to store of an episode with ``length`` steps. Its picture without contact is written."""
@@ -147,19 +153,7 @@ class FolderWriter(ABC):
 
 
 class PicturesWriter(FolderWriter):
-    """Writes single pictures and tables of several episodes.
-
-    Parameters
-    ----------
-    folder, about, rate_hz
-        As for ``FolderWriter``.
-    held_steps : int
-        Number of pictures after which a table of several episodes is written. With 0 each episode is safe at once.
-    """
-
-    def __init__(self, folder: Path, about: About, rate_hz: int, *, held_steps: int = HELD_STEPS) -> None:
-        super().__init__(folder, about, rate_hz)
-        self.held_steps = held_steps
+    """Writes single pictures and tables of several episodes."""
 
     @abstractmethod
     def _write_step(self, episode: Episode, step: RecordStep, number: int, k: int) -> Any:
@@ -179,7 +173,7 @@ class PicturesWriter(FolderWriter):
                 rows.append(self._write_step(episode, step, number, k))
             if len(rows) > before:
                 group.append(self._facts(episode, len(rows) - before))
-            if len(rows) > self.held_steps:
+            if len(rows) > (0 if self.at_once else HELD_STEPS):
                 self._commit(group, rows)
                 yield group
                 group, rows = [], []
@@ -212,23 +206,35 @@ def format_of(folder: Path) -> str:
     return str(read_sidecar(folder)[1]["format"]) if (folder / SIDECAR).is_file() else ""
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path, *, most_bytes: int = LARGEST_BYTES, error: type[TwinError] = RecordError, again: str = AGAIN) -> dict[str, Any]:
     """Keys and values of a JSON file.
 
     Raises
     ------
-    RecordError
-        The file can't be read or holds something else.
+    TwinError
+        Of the type ``error``: the file can't be read, is larger than ``most_bytes``, or holds something else. ``again`` is the remedy.
     """
     try:
-        found = json.loads(read_regular(path, LARGEST_BYTES))
-    except OSError as error:
-        raise RecordError(f"{path}: can't be read ({error.strerror}); {AGAIN}") from error
-    except (ValueError, RecursionError) as error:
-        raise RecordError(f"{path}: damaged, no JSON; {AGAIN}") from error
+        found = json.loads(read_regular(path, most_bytes))
+    except OSError as problem:
+        raise error(f"{path}: can't be read ({problem.strerror}); {again}") from problem
+    except (ValueError, RecursionError) as problem:
+        raise error(f"{path}: damaged, no JSON; {again}") from problem
     if not isinstance(found, dict):
-        raise RecordError(f"{path}: damaged, holds no keys and values; {AGAIN}")
+        raise error(f"{path}: damaged, holds no keys and values; {again}")
     return found
+
+
+def card(about: About, front: str, says: str) -> str:
+    """The page of a data set for Hugging Face: YAML at the front, what it is, and its columns."""
+    lines = [f"- `{channel_of(name).column}`: {channel_of(name).meaning}" for name in about.numbers]
+    return "\n".join([f"---\n{front}---\n\n# Records of the tactile sensor {about.sensor}\n\n{says}\n", *lines, ""])
+
+
+def write_tables(path: Path, table: Any) -> None:
+    """Write a Parquet file. Its folder is made if it does not exist."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_with(path, lambda file: library("pyarrow.parquet").write_table(table, file, write_page_checksum=True))
 
 
 @contextmanager
@@ -256,19 +262,19 @@ def require_numbered(files: Sequence[Path], name: Callable[[int], str]) -> None:
             raise RecordError(f"{path.parent}: {name(number)} is missing; {AGAIN}")
 
 
-def episode_of(folder: Path, facts: dict[str, Any], steps: Any) -> Episode:
-    """An episode from its stored facts.
+def episode_of(path: Path, facts: dict[str, Any], steps: Any, rest: ImageArray | None = None) -> Episode:
+    """An episode from its stored facts. They name the picture without contact unless it is given.
 
     Raises
     ------
     RecordError
         A part is damaged.
     """
-    try:
-        rest = None if facts["rest"] is None else read_image(folder / RESTS / str(facts["rest"]))[0]
+    damaged = (KeyError, TypeError, ValueError, FrameError)
+    with ErrorsAs(damaged, lambda error: RecordError(f"{path}: the stored facts of an episode are damaged ({error}); {AGAIN}")):
+        if rest is None and facts.get("rest") is not None:
+            rest = read_image(path / RESTS / str(facts["rest"]))[0]
         return Episode.from_facts(facts, steps, rest)
-    except (KeyError, TypeError, ValueError, FrameError) as error:
-        raise RecordError(f"{folder}: the stored facts of an episode are damaged ({error}); {AGAIN}") from error
 
 
 def records_in(folder: Path, form: str, facts: Sequence[dict[str, Any]], steps_of: Any) -> Records:

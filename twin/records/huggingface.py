@@ -17,27 +17,14 @@ import numpy as np
 from twin.errors import library
 from twin.frames.images import read_image, write_image
 from twin.frames.tables import base_name
-from twin.records.folder import PicturesWriter, read_facts, reading_tables, records_in, require_numbered
+from twin.records.folder import PicturesWriter, card, read_facts, reading_tables, records_in, require_numbered, write_tables
 from twin.records.record import CHANNELS, TIME, About, Episode, Records, RecordStep
-from twin.store import remove_parts, replace_folder, write_json, write_text, write_with
+from twin.store import remove_parts, replace_folder, write_json, write_text
 from twin.store.atomic import PART
 
 DATA, EPISODES, METADATA, CARD = "data", "episodes", "metadata.parquet", "README.md"
-CARD_TEXT = """---
-configs:
-- config_name: default
-  drop_labels: true
-  data_files: data/**
-tags:
-- tactile
----
-
-# Records of the tactile sensor {sensor}
-
-Pictures with metadata. In Python: `datasets.load_dataset("imagefolder", data_dir=...)`.
-
-{lines}
-"""
+FRONT = "configs:\n- config_name: default\n  drop_labels: true\n  data_files: data/**\ntags:\n- tactile\n"
+"""Begin of the page, by which Hugging Face reads the folder."""
 
 
 class HuggingFaceWriter(PicturesWriter):
@@ -56,8 +43,8 @@ class HuggingFaceWriter(PicturesWriter):
 
     def _begin(self) -> None:
         super()._begin()
-        lines = "\n".join(f"- `{CHANNELS[name].column}`: {CHANNELS[name].meaning}" for name in self.about.numbers)
-        write_text(self.folder / CARD, CARD_TEXT.format(sensor=self.about.sensor, lines=lines))
+        says = 'Pictures with metadata. In Python: `datasets.load_dataset("imagefolder", data_dir=...)`.'
+        write_text(self.folder / CARD, card(self.about, FRONT, says))
 
     def _find(self) -> list[dict[str, Any]]:
         self._begin()
@@ -76,12 +63,12 @@ class HuggingFaceWriter(PicturesWriter):
         return head | {TIME: float(step.time_s)} | numbers
 
     def _commit(self, group: list[dict[str, Any]], rows: list[Any]) -> None:
-        parquet, pa = library("pyarrow.parquet"), library("pyarrow")
+        pa = library("pyarrow")
         counted = [("file_name", pa.string()), ("episode_index", pa.int64()), ("frame_index", pa.int64()), ("task", pa.string())]
         kinds = {name: pa.list_(pa.float32()) for name in self.about.numbers}
         named = [(CHANNELS[name].column, pa.list_(kind) if len(self.about.shape(name)) == 2 else kind) for name, kind in kinds.items()]
         table = pa.Table.from_pylist(rows, pa.schema([*counted, (TIME, pa.float64()), *named]))
-        write_with(self._part / METADATA, lambda file: parquet.write_table(table, file, write_page_checksum=True))
+        write_tables(self._part / METADATA, table)
         replace_folder(self._part, self.folder / DATA / f"{self._next:06d}")
         write_json(self.folder / EPISODES / f"{self._next:06d}.json", {"episodes": group})
         self._next += 1

@@ -9,8 +9,8 @@ frame. In addition to LeRobot's columns, the table of episodes has ``tactip/fact
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator
-from functools import partial
+from collections.abc import Iterator, Mapping
+from functools import partial, reduce
 from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -22,7 +22,7 @@ from twin.errors import ErrorsAs, FrameError, format_count, library
 from twin.frames import open_recording
 from twin.frames.lerobot import COUNTERS
 from twin.frames.videos import describe_pauses
-from twin.records.folder import AGAIN, FolderWriter, image_of, png, read_json, read_sidecar, reading_tables, records_in
+from twin.records.folder import AGAIN, FolderWriter, card, image_of, png, read_json, read_sidecar, reading_tables, records_in, write_tables
 from twin.records.record import TIME, About, Episode, RecordError, Records, RecordStep, channel_of, image_column, off_s
 from twin.store import write_json, write_text, write_with
 from twin.types import Form
@@ -33,6 +33,8 @@ INFO, STATS, TASKS, CARD = "meta/info.json", "meta/stats.json", "meta/tasks.parq
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+FRONT = "task_categories:\n- robotics\ntags:\n- LeRobot\n- tactile\nconfigs:\n- config_name: default\n  data_files: data/*/*.parquet\n"
+"""Begin of the data set's page, by which Hugging Face reads it."""
 FACTS = "tactip/facts"
 """Column of the table of episodes with the facts that the other formats also store."""
 CHUNK_FILES = 1000
@@ -53,25 +55,15 @@ FOURCC = "mp4v"
 
 
 class LeRobotWriter(FolderWriter):
-    """Writes records as a LeRobotDataset of version 3.
-
-    Parameters
-    ----------
-    folder, about, rate_hz
-        As for ``FolderWriter``.
-    video : bool
-        Store pictures in videos, which lose detail, instead of as PNG in the tables.
-    held_mb : float
-        Size, MB, after which a file of several episodes is finished. With 0 each episode has its own file and is safe at once.
-    """
+    """Writes records as a LeRobotDataset of version 3, with pictures as PNG in the tables, or in videos."""
 
     FORMAT = "lerobot"
     NAMES = ("meta", "data", "videos", CARD)
     LIBRARIES = ("pyarrow.parquet",)
+    VIEWS, VIDEOS = True, True
 
-    def __init__(self, folder: Path, about: About, rate_hz: int, *, video: bool = False, held_mb: float = DATA_MB) -> None:
-        super().__init__(folder, about, rate_hz)
-        self.video, self.held_bytes = video, held_mb * 1e6
+    def __init__(self, folder: Path, about: About, rate_hz: int, **options: bool) -> None:
+        super().__init__(folder, about, rate_hz, **options)
         self._images = [image_column(view) for view in about.views]
         self._file = self._frames = 0  # number of the next file, and number of frames so far
         self._tasks: list[str] = []
@@ -82,7 +74,7 @@ class LeRobotWriter(FolderWriter):
         return super()._metadata() | {"video": self.video}
 
     def _begin(self) -> None:
-        write_text(_make_folder(self.folder / CARD), _card(self.about))
+        write_text(self.folder / CARD, card(self.about, FRONT, "A LeRobotDataset of version 3."))
 
     def _find(self) -> list[dict[str, Any]]:
         self.video = bool(read_sidecar(self.folder)[1].get("video", False))
@@ -90,15 +82,14 @@ class LeRobotWriter(FolderWriter):
         if rows:
             chunk, file = (int(rows[-1][f"data/{key}"]) for key in ("chunk_index", "file_index"))
             self._file, self._frames = 1 + chunk * CHUNK_FILES + file, int(rows[-1]["dataset_to_index"])
-            self._tasks = _tasks(self.folder)
+            with reading_tables(self.folder / TASKS) as parquet:
+                self._tasks = [str(task) for task in parquet.read_table(self.folder / TASKS)["__index_level_0__"].to_pylist()]
             stats = read_json(self.folder / STATS)
             self._stats = {key: {k: np.asarray(v, float) for k, v in each.items()} for key, each in stats.items()}
-        videos = [VIDEO_PATH.replace("{video_key}", image) for image in self._images]
-        for pattern in (DATA_PATH, EPISODES_PATH, *videos):  # files of a run that was killed
-            for path in self.folder.glob(pattern.partition("/chunk")[0] + "/chunk-*/file-*"):
-                chunk, file = (int(part.split("-")[1].split(".")[0]) for part in path.parts[-2:])
-                if chunk * CHUNK_FILES + file >= self._file:
-                    path.unlink()
+        for path in self.folder.glob("**/chunk-*/file-*"):
+            chunk, file = (int(part.split("-")[1].split(".")[0]) for part in path.parts[-2:])
+            if chunk * CHUNK_FILES + file >= self._file:  # of a run that was killed
+                path.unlink()
         return [_facts_of(row) for row in rows]
 
     def _groups(self, episodes: Iterator[Episode]) -> Iterator[list[dict[str, Any]]]:
@@ -110,7 +101,8 @@ class LeRobotWriter(FolderWriter):
         """Write a file of episodes, then the data set's description. Returns the facts of each episode."""
         group: list[tuple[dict[str, Any], dict[str, Any], Stats]] = []  # row, facts and statistics of each episode
         at = {"chunk_index": self._file // CHUNK_FILES, "file_index": self._file % CHUNK_FILES}
-        path = _make_folder(self.folder / DATA_PATH.format(**at))
+        path = self.folder / DATA_PATH.format(**at)
+        path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="twin-video-") as aside:
             films = {image: Path(aside) / f"{image}.mp4" for image in self._images} if self.video else {}
             write_with(path, partial(self._fill, waiting=waiting, group=group, at=at, films=films))
@@ -118,12 +110,11 @@ class LeRobotWriter(FolderWriter):
                 path.unlink()
                 return []
             for image, film in films.items():
-                into = _make_folder(self.folder / VIDEO_PATH.format(video_key=image, **at))
+                into = self.folder / VIDEO_PATH.format(video_key=image, **at)
+                into.parent.mkdir(parents=True, exist_ok=True)
                 with film.open("rb") as made:
                     write_with(into, partial(shutil.copyfileobj, made))
-        stats = self._stats
-        for _, _, each in group:
-            stats = _together(stats, each)
+        stats = reduce(_together, (each for _, _, each in group), self._stats)
         self._write_meta(group, at, stats)
         self._stats, self._file = stats, self._file + 1
         self._frames += sum(row["length"] for row, _, _ in group)
@@ -134,7 +125,10 @@ class LeRobotWriter(FolderWriter):
         parquet, pa = library("pyarrow.parquet"), library("pyarrow")
         schema = self._schema(pa)
         frames, written = self._frames, 0
-        opened = [_open_film(path, self.rate_hz, self.about.size_px) for path in films.values()]
+        codec = cv2.VideoWriter.fourcc(*FOURCC)
+        opened = [cv2.VideoWriter(str(path), codec, float(self.rate_hz), self.about.size_px) for path in films.values()]
+        if not all(film.isOpened() for film in opened):
+            raise RecordError(f"this OpenCV can't write {FOURCC} videos; leave out `video`")
         with parquet.ParquetWriter(file, schema, compression="snappy", write_page_checksum=True) as table:
             for episode in waiting:
                 number, rows, length = len(self.facts) + len(group), [], 0
@@ -164,7 +158,7 @@ class LeRobotWriter(FolderWriter):
                 row = self._episode_row(episode, number, frames, length, at)
                 group.append((row, self._facts(episode, length), stats))
                 frames += length
-                if written >= self.held_bytes:
+                if self.at_once or written >= DATA_MB * 1e6:
                     break
         for film in opened:
             film.release()
@@ -230,13 +224,8 @@ class LeRobotWriter(FolderWriter):
         return features | {name: {"dtype": "int64", "shape": [1], "names": None} for name in COUNTERS}
 
     def _episode_row(self, episode: Episode, number: int, start: int, length: int, at: dict[str, int]) -> dict[str, Any]:
-        row = {
-            "episode_index": number,
-            "tasks": [episode.task],
-            "length": length,
-            "dataset_from_index": start,
-            "dataset_to_index": start + length,
-        }
+        row: dict[str, Any] = {"episode_index": number, "tasks": [episode.task], "length": length}
+        row |= {"dataset_from_index": start, "dataset_to_index": start + length}
         for what in ("data", "meta/episodes", *(f"videos/{image}" for image in self._images if self.video)):
             row |= {f"{what}/{key}": value for key, value in at.items()}
         if self.video:
@@ -247,58 +236,43 @@ class LeRobotWriter(FolderWriter):
 
     def _write_meta(self, group: list, at: dict[str, int], stats: Stats) -> None:
         """Write the data set's description. The number of episodes comes last."""
-        parquet, pa = library("pyarrow.parquet"), library("pyarrow")
+        pa = library("pyarrow")
         index = {"name": None, "field_name": "__index_level_0__", "pandas_type": "unicode", "numpy_type": "object", "metadata": None}
         column = {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64", "metadata": None}
         pandas = {"index_columns": ["__index_level_0__"], "column_indexes": [], "columns": [column, index], "pandas_version": "2.2.0"}
         tasks = pa.table({"task_index": pa.array(range(len(self._tasks)), pa.int64()), "__index_level_0__": self._tasks})
         tasks = tasks.replace_schema_metadata({"pandas": json.dumps(pandas)})
-        write_with(_make_folder(self.folder / TASKS), lambda file: parquet.write_table(tasks, file, write_page_checksum=True))
+        write_tables(self.folder / TASKS, tasks)
         rows = [
             row | {f"stats/{key}/{k}": v.tolist() for key, each in found.items() for k, v in each.items()} | {FACTS: json.dumps(facts)}
             for row, facts, found in group
         ]
-        write_with(
-            _make_folder(self.folder / EPISODES_PATH.format(**at)),
-            lambda file: parquet.write_table(pa.Table.from_pylist(rows), file, write_page_checksum=True),
-        )
+        write_tables(self.folder / EPISODES_PATH.format(**at), pa.Table.from_pylist(rows))
         write_json(self.folder / STATS, {key: {k: v.tolist() for k, v in each.items()} for key, each in stats.items()})
         last = group[-1][0]
-        write_json(
-            self.folder / INFO,
-            {
-                "codebase_version": CODEBASE,
-                "robot_type": self.about.robot or None,
-                "total_episodes": last["episode_index"] + 1,
-                "total_frames": last["dataset_to_index"],
-                "total_tasks": len(self._tasks),
-                "chunks_size": CHUNK_FILES,
-                "data_files_size_in_mb": DATA_MB,
-                "video_files_size_in_mb": VIDEO_MB,
-                "fps": self.rate_hz,
-                "splits": {"train": f"0:{last['episode_index'] + 1}"},
-                "data_path": DATA_PATH,
-                "video_path": VIDEO_PATH if self.video else None,
-                "features": self._features(),
-            },
-        )
+        count = last["episode_index"] + 1
+        info: dict[str, Any] = {"codebase_version": CODEBASE, "robot_type": self.about.robot or None}
+        info |= {"total_episodes": count, "total_frames": last["dataset_to_index"], "total_tasks": len(self._tasks)}
+        info |= {"chunks_size": CHUNK_FILES, "data_files_size_in_mb": DATA_MB, "video_files_size_in_mb": VIDEO_MB}
+        info |= {"fps": self.rate_hz, "splits": {"train": f"0:{count}"}, "data_path": DATA_PATH}
+        info |= {"video_path": VIDEO_PATH if self.video else None, "features": self._features()}
+        write_json(self.folder / INFO, info)
 
 
 class _Gathered:
     """Data from which an episode's statistics are computed."""
 
     def __init__(self, about: About) -> None:
-        self._values: dict[str, list[np.ndarray]] = {name: [] for name in about.numbers}
+        self._about = about
         self.times_s: list[float] = []
-        self._images = [image_column(view) for view in about.views]
+        self._values: list[Mapping[str, np.ndarray]] = []
         self._pictures: list[list[np.ndarray]] = []  # of each kept step
         self._every = 1
 
     def add(self, step: RecordStep, number: int) -> None:
         """Add a step. Of a long episode only every second picture is kept, then every fourth, and so on."""
-        for name, values in self._values.items():
-            values.append(np.asarray(step.values[name], np.float32))
         self.times_s.append(step.time_s)
+        self._values.append(step.values)
         if number % self._every == 0:
             self._pictures.append([_colour(image)[::PIXEL_STEP, ::PIXEL_STEP] for image in step.images])
         if len(self._pictures) > 2 * SAMPLED:
@@ -306,19 +280,19 @@ class _Gathered:
 
     def stats(self, rate_hz: int, number: int, start: int, task: int) -> Stats:
         """Statistics of each column, in LeRobot's shapes: (3, 1, 1) for pictures, with values from 0 to 1, and (2,) for pins."""
-        length = len(self.times_s)
-        found = {}
-        for column, pictures in zip(self._images, zip(*self._pictures, strict=True), strict=True):
+        length, found = len(self.times_s), {}
+        images = [image_column(view) for view in self._about.views]
+        for column, pictures in zip(images, zip(*self._pictures, strict=True), strict=True):
             pixels = np.stack(pictures).reshape(-1, 3) / 255.0
             found[column] = {key: value.reshape(-1, 1, 1) for key, value in _deviations(pixels).items()}
-        for name, values in self._values.items():
-            stacked = np.stack(values).astype(float)
+        for name in self._about.numbers:
+            stacked = np.stack([np.asarray(values[name], np.float32) for values in self._values]).astype(float)
             found[channel_of(name).column] = _deviations(stacked.reshape(-1, stacked.shape[-1]))
         frames = np.arange(length)
         counters = (frames, np.full(length, number), start + frames, np.full(length, task))
         plain = {TIME: np.array(self.times_s), "timestamp": frames / rate_hz} | dict(zip(COUNTERS, counters, strict=True))
         found |= {name: _deviations(np.asarray(values, float)[:, None]) for name, values in plain.items()}
-        return {name: each | {"count": np.array([len(self._pictures) if name in self._images else length])} for name, each in found.items()}
+        return {name: each | {"count": np.array([len(self._pictures) if name in images else length])} for name, each in found.items()}
 
 
 def _deviations(rows: np.ndarray) -> dict[str, np.ndarray]:
@@ -327,23 +301,17 @@ def _deviations(rows: np.ndarray) -> dict[str, np.ndarray]:
     some = known.any(axis=0)
     safe = np.where(some, rows, 0.0)
     levels = np.nanpercentile(safe, list(QUANTILES.values()), axis=0)
-    return {
-        "min": np.nanmin(safe, axis=0),
-        "max": np.nanmax(safe, axis=0),
-        "mean": np.nanmean(safe, axis=0),
-        "std": np.nanstd(safe, axis=0),
-        **dict(zip(QUANTILES, levels, strict=True)),
-    }
+    found = {name: getattr(np, f"nan{name}")(safe, axis=0) for name in ("min", "max", "mean", "std")}
+    return found | dict(zip(QUANTILES, levels, strict=True))
 
 
 def _together(a: Stats, b: Stats) -> Stats:
     """Statistics of the union of two sets of rows. As in LeRobot, quantiles are averaged with the numbers of rows as weights."""
+    if not a:
+        return b
     found = {}
     for key, new in b.items():
-        old = a.get(key)
-        if old is None:
-            found[key] = new
-            continue
+        old = a[key]
         n, m = float(old["count"][0]), float(new["count"][0])
         mean = (n * old["mean"] + m * new["mean"]) / (n + m)
         square = (n * (old["std"] ** 2 + old["mean"] ** 2) + m * (new["std"] ** 2 + new["mean"] ** 2)) / (n + m)
@@ -356,14 +324,6 @@ def _together(a: Stats, b: Stats) -> Stats:
             "count": old["count"] + new["count"],
         }
     return found
-
-
-def _open_film(path: Path, rate_hz: int, size_px: tuple[int, int]) -> cv2.VideoWriter:
-    """A video to which frames are written."""
-    film = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*FOURCC), float(rate_hz), size_px)
-    if not film.isOpened():
-        raise RecordError(f"this OpenCV can't write {FOURCC} videos; leave out `video`")
-    return film
 
 
 def lerobot_records(folder: Path) -> Records:
@@ -427,34 +387,11 @@ def _episode_rows(folder: Path) -> list[dict[str, Any]]:
 
 
 def _facts_of(row: dict[str, Any]) -> dict[str, Any]:
-    try:
-        facts = json.loads(row[FACTS])
-        if isinstance(facts, dict):
-            return facts
-    except (KeyError, TypeError, ValueError, RecursionError):
-        pass
-    raise RecordError("the table of episodes is damaged, or this data set was not written by this program; give one that it wrote")
-
-
-def _tasks(folder: Path) -> list[str]:
-    with reading_tables(folder / TASKS) as parquet:
-        return [str(task) for task in parquet.read_table(folder / TASKS)["__index_level_0__"].to_pylist()]
+    why = "the table of episodes is damaged, or this data set was not written by this program; give one that it wrote"
+    with ErrorsAs((KeyError, TypeError, ValueError, RecursionError), lambda _: RecordError(why)):
+        return dict(json.loads(row[FACTS]))
 
 
 def _colour(image: np.ndarray) -> np.ndarray:
     """The picture with three channels."""
     return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
-
-
-def _make_folder(path: Path) -> Path:
-    """The path. Its folder is made if it does not exist."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path
-
-
-def _card(about: About) -> str:
-    """The data set's page."""
-    files = "configs:\n- config_name: default\n  data_files: data/*/*.parquet\n"
-    head = f"---\ntask_categories:\n- robotics\ntags:\n- LeRobot\n- tactile\n{files}---\n\n"
-    lines = [f"- `{channel_of(name).column}`: {channel_of(name).meaning}" for name in about.numbers]
-    return head + f"# Records of the tactile sensor {about.sensor}\n\nA LeRobotDataset of version 3.\n\n" + "\n".join(lines) + "\n"

@@ -58,27 +58,21 @@ class Channel:
     meaning: str
 
 
+_WRENCH = "force (N) and torque (N mm) of the skin on the object, in the sensor frame"
+_ACTION = "the pose that the arm was sent to, mm and deg; or as the record names it"
 CHANNELS = {
     channel.name: channel
     for channel in (
         Channel("pins", "observation.tactile.pins", "/tactip/pins", (), "x, y of each pin in px of the picture; NaN: not found"),
         Channel("pose", "observation.state", "/tactip/arm_pose", POSE_AXES, "the tool's pose, mm and deg"),
         Channel("move", "observation.tactile.move", "/tactip/move", POSE_AXES, "the move (shear) before the picture, mm and deg"),
-        Channel(
-            "wrench",
-            "observation.tactile.wrench",
-            "/tactip/wrench",
-            WRENCH_AXES,
-            "force (N) and torque (N mm) of the skin on the object, in the sensor frame",
-        ),
+        Channel("wrench", "observation.tactile.wrench", "/tactip/wrench", WRENCH_AXES, _WRENCH),
         Channel("estimate", "observation.tactile.estimate", "/tactip/estimate", (), "the model's estimate, mm and deg; NaN: not valid"),
         Channel("low", "observation.tactile.estimate_low", "/tactip/estimate_low", (), "lower end of its 90 % interval"),
         Channel("high", "observation.tactile.estimate_high", "/tactip/estimate_high", (), "upper end of its 90 % interval"),
         Channel("width", "observation.gripper_width", "/tactip/gripper_width", ("mm",), "the gripper's width, mm"),
         Channel("goal", "observation.environment_state", "/tactip/goal", (), "the goal of the task"),
-        Channel(
-            "action", "action", "/tactip/command", POSE_AXES, "the pose that the arm was sent to, mm and deg; or as the record names it"
-        ),
+        Channel("action", "action", "/tactip/command", POSE_AXES, _ACTION),
     )
 }
 """All channels, in the order in which formats have them."""
@@ -167,9 +161,8 @@ class About:
 
     def plain(self) -> dict[str, Any]:
         """The properties as JSON."""
-        return TypeAdapter(About).dump_python(self, mode="json", warnings=False) | {
-            "channels": {name: channel_of(name).meaning for name in self.numbers}
-        }
+        plain = TypeAdapter(About).dump_python(self, mode="json", warnings=False)
+        return plain | {"channels": {name: channel_of(name).meaning for name in self.numbers}}
 
     @classmethod
     def of(cls, plain: Mapping[str, Any]) -> "About":
@@ -189,9 +182,8 @@ class About:
     def differs(self, other: "About") -> list[str]:
         """Reasons why episodes of another record do not fit into this one."""
         mine, its = self.plain(), other.plain()
-        return [
-            f"{key} {its[key]!r} instead of {mine[key]!r}" for key in mine if key not in ("channels", "robot") and mine[key] != its[key]
-        ]
+        compared = mine.keys() - {"channels", "robot"}
+        return [f"{key} {its[key]!r} instead of {mine[key]!r}" for key in mine if key in compared and mine[key] != its[key]]
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ Recordings of any origin, collections, and simulated data sets with their truth 
 import csv
 import json
 from collections.abc import Iterator
-from dataclasses import replace
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,8 @@ from twin.frames.images import write_image
 from twin.frames.tables import numbers
 from twin.records.folder import AGAIN, PicturesWriter, episode_of, format_of, read_facts, read_json, read_sidecar
 from twin.records.record import CHANNELS, NOMINAL_HZ, About, Channel, Episode, RecordError, Records, RecordStep, digest, float32, seconds
+from twin.rig.kinematics import Mounting
 from twin.rig.labels import as_executed, read_executed
-from twin.rig.mounting import Mounting
 from twin.store import text_file, write_json, write_npz
 from twin.types import Form
 
@@ -58,11 +58,11 @@ def recording_records(path: Path, form: Form | None = None) -> Records:
     """
     if path.is_dir() and (path / TRUTH).is_dir() and not any((path / name).is_dir() for name in ("images", "frames_bw")):
         raise RecordError(f"{path}: holds pins without pictures; make the data set with `images` raw, gray or processed")
-    own = format_of(path) == RecordingWriter.FORMAT if path.is_dir() else False
-    if own and not (path / EPISODES).is_file():
-        return Records(read_sidecar(path)[0], [])
+    stated = read_sidecar(path)[0] if path.is_dir() and format_of(path) == RecordingWriter.FORMAT else None
+    if stated is not None and not (path / EPISODES).is_file():
+        return Records(stated, [])
     recording = open_recording(path, None, form)
-    values, estimates = _table_values(recording, read_sidecar(path)[0].names if own else {})
+    values, estimates = _table_values(recording, {} if stated is None else stated.names)
     notes = list(recording.problems)
     _take_out_moves(path, recording, values, notes)
     values |= _read_pins(path, recording) | _read_truth(path, recording) | _read_requested_poses(path, recording)
@@ -71,32 +71,30 @@ def recording_records(path: Path, form: Form | None = None) -> Records:
     if found is None:
         raise RecordError(f"{path}: no frame can be read; {AGAIN}")
     described = _read_description(path)
-    about = About(
+    about = stated or About(
         sensor=str(described.get("sensor", "")),
         form=recording.form,
         size_px=recording.size_px,
         gray=found.image.ndim == 2,
-        numbers={name: int(np.prod(values[name].shape[1:])) for name in CHANNELS if name in values},
+        numbers={name: int(np.prod(array.shape[1:])) for name, array in values.items()},
         estimates=estimates,
         robot=str(described.get("arm", "")),
     )
-    if own:
-        about = read_sidecar(path)[0]
-        if missing := set(about.numbers) - set(values):
-            raise RecordError(f"{path}: {PINS if missing == {'pins'} else TABLE} is missing, or lacks columns; {AGAIN}")
+    if missing := set(about.numbers) - set(values):
+        raise RecordError(f"{path}: {PINS if missing == {'pins'} else TABLE} is missing, or lacks columns; {AGAIN}")
     carried = {column for name in values for column in columns_of(CHANNELS[name], about.axes(name))} | NOT_CARRIED
     left = [name for name, cells in recording.labels.items() if name not in carried and cells.dtype.kind == "f"]
     notes += [f"columns {', '.join(left)} are not copied into the record"] if left else []
     records = Records(about, [], notes)
     rest = None if recording.reference is None else recording.reference.image
-    facts = read_facts(path / EPISODES) if own else []
+    facts = [] if stated is None else read_facts(path / EPISODES)
     for number, rows in enumerate(_paths(recording)):
         times_s = _times(recording, rows, notes)
         steps = partial(_steps_of, recording, values, rows, times_s, notes)
-        if own:
+        if stated is not None:
             if number == len(facts):  # the rest was unfinished when a run was killed
                 break
-            records.episodes.append(replace(episode_of(path, facts[number] | {"rest": None}, steps), rest=rest))
+            records.episodes.append(episode_of(path, facts[number], steps, rest))
             continue
         labels = {name: array[rows[0]].tolist() for name, array in values.items() if name in ("pose", "move")}
         key = f"{path.name}/{recording.names[rows[0]]}#{digest(labels, len(rows))}"
@@ -133,10 +131,8 @@ def _times(recording: Recording, rows: np.ndarray, notes: list[str]) -> np.ndarr
         times_s = numbers(recording.labels[TIME_S][rows])
         if np.isfinite(times_s).all() and (np.diff(times_s) >= 0).all():
             return times_s
-        note = (
-            f"column {TIME_S} does not increase everywhere, or has cells without a number; such episodes get {NOMINAL_HZ:g} frames per "
-            "second"
-        )
+        fault = "does not increase everywhere, or has cells without a number"
+        note = f"column {TIME_S} {fault}; such episodes get {NOMINAL_HZ:g} frames per second"
         if len(rows) > 1 and note not in notes:
             notes.append(note)
     return np.arange(len(rows)) / NOMINAL_HZ
@@ -207,11 +203,9 @@ def _read_requested_poses(path: Path, recording: Recording) -> dict[str, np.ndar
         return {}
     asked = {}
     for line in read_regular(path / LOG, 1_000_000_000).decode("utf-8", "replace").splitlines():
-        try:
+        with suppress(ValueError, KeyError, TypeError, RecursionError):
             found = json.loads(line)
             asked[str(found["image_name"])] = float32(found["asked"][:6], 6)
-        except (ValueError, KeyError, TypeError, RecursionError):
-            continue
     none = np.full(6, np.nan, np.float32)
     return {"action": np.stack([asked.get(name, none) for name in recording.names])} if asked else {}
 

@@ -10,23 +10,25 @@ import math
 import os
 import time
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from scenes import load_experiment, load_sensor
-from scenes.base import Name, SpecError
+from scenes.base import Name, SpecError, problem_text
 from scenes.files import quote, read_regular
 from twin.errors import ErrorsAs, FrameError, StoreError, format_count
 from twin.frames.forms import times
 from twin.frames.images import read_image, write_image
 from twin.frames.videos import describe_pauses
+from twin.records.folder import read_json
 from twin.records.record import CHANNELS, POSE_AXES, About, Episode, Records, RecordStep, digest, float32, seconds
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 from twin.store import contents, write_json, writing
 from twin.types import Form, Frame
 
@@ -42,7 +44,7 @@ def is_session(path: str | Path) -> bool:
     return (Path(path) / ABOUT).is_file() and (Path(path) / STEPS).is_file()
 
 
-class SessionWriter:
+class SessionWriter(AbstractContextManager["SessionWriter"]):
     """Appends the steps of a session.
 
     Parameters
@@ -99,9 +101,6 @@ class SessionWriter:
         """
         with writing(self.folder / STEPS):
             self._lines.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
@@ -179,7 +178,10 @@ class Session:
         self.folder = Path(folder)
         if not is_session(self.folder):
             raise FrameError(f"{folder}: holds no recorded session ({ABOUT} and {STEPS} are expected); '--record DIR' writes one")
-        self.about = self._read_about()
+        self.about = read_json(self.folder / ABOUT, most_bytes=LARGEST_ABOUT_BYTES, error=FrameError, again="copy the session again")
+        if (version := self.about.get("version")) != VERSION:
+            said = f"is of version {quote(version)}, expected {VERSION}; replay it with the program that wrote it"
+            raise FrameError(f"{self.folder / ABOUT}: {said}")
         self.steps, note = _steps_and_note(self.folder)
         if not self.steps:
             raise FrameError(f"{folder}: {note or 'the session ended before its first step'}; nothing to replay, record it again")
@@ -190,28 +192,12 @@ class Session:
         self.notes = [each for each in (note, loose_note) if each]
         self.form = self._lines[0].form
 
-    def _read_about(self) -> dict:
-        try:
-            about = json.loads(read_regular(self.folder / ABOUT, LARGEST_ABOUT_BYTES).decode("utf-8-sig"))
-        except OSError as error:
-            raise FrameError(f"{self.folder}: {ABOUT} can't be read ({error.strerror}); copy the session again") from error
-        except (ValueError, RecursionError) as error:
-            raise FrameError(f"{self.folder}: {ABOUT} is no JSON; copy the session again") from error
-        if not isinstance(about, dict) or "version" not in about:
-            raise FrameError(f"{self.folder}: {ABOUT} is not that of a session; copy the session again")
-        if about["version"] != VERSION:
-            version = quote(about["version"])
-            raise FrameError(
-                f"{self.folder}: {ABOUT} is of version {version}, expected {VERSION}; replay it with the program that wrote it"
-            )
-        return about
-
     def _check_step(self, number: int, step: dict) -> _StepLine:
         try:
             line = _StepLine.model_validate(step)
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
-            key, problem = ".".join(quote(part) for part in first["loc"]), quote(first["msg"].removeprefix("Value error, "))
+            key, problem = ".".join(map(quote, first["loc"])), quote(problem_text(first))
             raise FrameError(f"{self.folder}: {STEPS}, line {number}: {key}: {problem}; copy the session again") from error
         if line.step != number - 1:
             raise FrameError(f"{self.folder}: {STEPS}, line {number} is of step {line.step}: lines are missing; copy the session again")
@@ -253,6 +239,9 @@ class Session:
         line = self._lines[index]
         return Frame(self._picture(f"{FRAMES}/{line.file}"), line.form, line.name, line.time_s, line.sequence)
 
+    def __iter__(self) -> Iterator[Frame]:
+        return map(self.frame, range(len(self.steps)))
+
     def step_s(self, index: int) -> float:
         """Time of a step: the exposure of its frame, and the time that passed since the first step that used this frame."""
         first = index
@@ -277,11 +266,10 @@ def session_records(folder: Path) -> Records:
     names: dict[str, tuple[str, ...]] = {}
     if "sent_mm" in first:
         counts["action"], names = 7, {"action": (*POSE_AXES, "width")}
-    size_px = image.shape[1], image.shape[0]
     about = About(
         sensor=str(session.about.get("sensor", "")),
         form=session.form,
-        size_px=size_px,
+        size_px=(image.shape[1], image.shape[0]),
         gray=image.ndim == 2,
         numbers={name: counts[name] for name in CHANNELS if name in _KEYS and _KEYS[name][0] in first and counts[name]},
         estimates=estimates,
@@ -344,20 +332,20 @@ def _steps_of(session: Session, about: About, first_s: float) -> Iterator[Record
         frame = session.frame(index)
         if frame.image.shape[1::-1] != about.size_px:
             got, expected = times(frame.image.shape[1::-1]), times(about.size_px)
-            raise FrameError(
-                f"{session.folder}: {line['frame']['file']}: expected {expected} as the first frame, got {got}; record it again"
-            )
-        try:
-            values = {name: _numbers_in(line, name, about) for name in about.numbers}
-        except (TypeError, ValueError) as error:
-            raise FrameError(f"{session.folder}: {STEPS}, line {index + 1} holds no numbers ({error}); copy the session again") from error
+            place = f"{session.folder}: {line['frame']['file']}"
+            raise FrameError(f"{place}: expected {expected} as the first frame, got {got}; record it again")
+        values = _numbers_in(line, about, f"{session.folder}: {STEPS}, line {index + 1}")
         yield RecordStep(frame.image, seconds(session.step_s(index) - first_s), values)
 
 
-def _numbers_in(line: dict, name: str, about: About) -> np.ndarray:
-    """The numbers of a channel in a step's line."""
-    parts = [np.ravel(np.asarray(line.get(key, []), object)) for key in _KEYS[name]]
-    return float32(np.concatenate(parts), about.numbers[name]).reshape(about.shape(name))
+def _numbers_in(line: dict, about: About, place: str) -> dict[str, np.ndarray]:
+    """The numbers of each channel in a step's line; ``place`` is where the line is, for errors."""
+    values = {}
+    with ErrorsAs((TypeError, ValueError), lambda error: FrameError(f"{place} holds no numbers ({error}); copy the session again")):
+        for name, count in about.numbers.items():
+            parts = [np.ravel(np.asarray(line.get(key, []), object)) for key in _KEYS[name]]
+            values[name] = float32(np.concatenate(parts), count).reshape(about.shape(name))
+    return values
 
 
 def _started_s(session: Session) -> float:

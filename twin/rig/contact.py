@@ -22,13 +22,11 @@ import numpy as np
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
 from scenes.rig import RigSpec
-from twin.mechanics.balance import Friction
-from twin.mechanics.law import ContactLaw, friction_of
+from twin.mechanics.law import ContactLaw, Friction, friction_of
 from twin.mechanics.solver import SkinSolver
 from twin.objects import build_field
-from twin.rig.kinematics import ArmPath, arm_path, rig_of
+from twin.rig.kinematics import ArmPath, Mounting, arm_path, rig_of
 from twin.rig.labels import ArmLabel
-from twin.rig.mounting import Mounting
 from twin.types import ContactState
 
 
@@ -118,7 +116,7 @@ class RigContact:
         self.solver, self.experiment = solver, experiment
         self.rig = rig or rig_of(solver.spec, obj.name)
         self.field = build_field(obj)
-        mounting = Mounting.on(self.rig, experiment, solver.spec.skin)
+        mounting = Mounting(self.rig, experiment, solver.spec.skin)
         self.law = contact_law(self.rig if rig or solver.spec.rig else None, mounting, obj)
 
     def commanded_path(self, label: ArmLabel) -> ArmPath:

@@ -1,4 +1,5 @@
-"""Kinematics of the rig: conversion of a label in robot coordinates to the object's path in the sensor frame.
+"""Kinematics of the rig: conversion of a label in robot coordinates to the object's path in the sensor frame; and the mounting of a sensor
+on an arm's tool, with the labels of zero depth and zero angle.
 
 The robot's work frame has the axes x, y and z. Without rotation, the sensor looks along the approach a0. b0 is the direction across: robot
 x, or robot y if the approach is x. It appears in the image at the azimuth ``image_turn``. c0 is a0 x b0. With the static xyz rotation R by
@@ -14,6 +15,7 @@ All poses here are commanded poses. ``twin.rig.contact`` adds the effect of the 
 """
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,24 +24,19 @@ from scenes.body import SkinSpec
 from scenes.experiment import ExperimentSpec
 from scenes.rig import RigSpec
 from scenes.sensor import SensorSpec
-from twin.errors import ContactError
 from twin.geometry.shapes import shape_of
-from twin.mechanics.path import ContactPath
+from twin.mechanics.path import SKIN_POINTS, ContactPath, march_to_touch
 from twin.objects import ObjectField
 from twin.rig.labels import ArmLabel
 
+Number = TypeVar("Number", float, np.ndarray)
+
 MOST_TURN_DEG = 1.0  # largest rotation between two poses of the path; its straight legs then differ from the arm's arc by a few um
-TOUCH_TOLERANCE_MM = 1e-6  # tolerance of a first touch: largest distance between object and skin
-TOUCH_POINTS = 20_000  # points on a whole sphere; between them a dome bulges by less than 2 um
-MOST_MARCHES = 400  # largest number of steps in the search for the first touch; about ten are usual
 CLEAR_MM = 10.0  # length by which the search extends the start of the tap; recorded taps of 5 mm begin up to 0.4 mm inside the object
 
 TURNING = {"x": 5, "y": 5, "z": 4}  # by approach: index of the label that rotates the tool in the plane of approach and across
-_UNTURNED = {  # by approach; columns are the sensor's x (across), y and z (approach) in the work frame
-    "x": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
-    "y": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
-    "z": np.eye(3),
-}
+_DIRECTIONS = {"x": ((1, 0, 0), (0, 1, 0)), "y": ((0, 1, 0), (1, 0, 0)), "z": ((0, 0, 1), (1, 0, 0))}  # approach, across
+_SENSOR_AXIS = np.array([0.0, 0.0, 1.0])  # in the sensor frame
 
 
 @dataclass(frozen=True)
@@ -77,9 +74,110 @@ def rig_of(sensor: SensorSpec, before: str | None = None) -> RigSpec:
     return rig if before is None else rig.for_object(before)
 
 
+class Mounting:
+    """A sensor on a tool: a skin on a rig, with an experiment's approach and zero.
+
+    The servo follows a surface in the plane of ``axis`` and ``across``.
+
+    Attributes
+    ----------
+    axis : (3,) float
+        The sensor's z (out of the skin's apex) in the tool frame.
+    across : (3,) float
+        Direction in the tool frame along which the tool is fed; it is perpendicular to the axis.
+    image_turn_deg : float
+        Azimuth of ``across`` in the sensor frame, from image x towards image y.
+    centre_mm : (3,) float
+        The sensor's origin in the tool frame: the centre of a dome, or the centre of a pad's outside.
+    skin_apex_mm : float
+        z of the skin's apex in the sensor frame: the radius of a dome, or 0 for a pad.
+    skin_reach_mm : float
+        Largest distance of the skin from the origin.
+    depth_label, angle_label : str
+        Names of the labels for the depth of the tool, and for its angle from the surface's normal.
+    zero_mm, zero_deg : float
+        Indentation at which the label of the depth is 0, and label of the angle at which the sensor is normal to the surface.
+    angle_sign : int
+        -1 if the label increases when the tool rotates from the axis towards ``across``.
+    """
+
+    def __init__(self, rig: RigSpec, experiment: ExperimentSpec, skin: SkinSpec) -> None:
+        self.axis, self.across = axis, across = np.array(_DIRECTIONS[experiment.approach], float)
+        self.image_turn_deg = rig.image_turn_deg
+        self.centre_mm = rig.tcp_to_dome_mm * axis + rig.tcp_lateral_mm * across + rig.tcp_binormal_mm * np.cross(axis, across)
+        self.skin_apex_mm, self.skin_reach_mm = skin.apex_mm, max(skin.apex_mm, *skin.half_size_mm)
+        about = TURNING[experiment.approach] - 3
+        self.depth_label, self.angle_label = f"pose_{experiment.axis + 1}", f"pose_{about + 4}"
+        self.angle_sign = int(np.sign(self.out_of_plane[about])) * rig.turn_sign
+        self.zero_mm = experiment.zero_mm + rig.contact_offset_mm
+        self.zero_deg = self.angle_sign * rig.plate_tilt_deg - rig.turn_offset_deg[about]
+
+    @property
+    def out_of_plane(self) -> np.ndarray:
+        """Axis (3,) in the tool frame of a rotation by a positive angle: from ``across`` towards ``axis``."""
+        return np.cross(self.across, self.axis)
+
+    @property
+    def apex_mm(self) -> np.ndarray:
+        """The skin's apex (3,) in the tool frame."""
+        return self.centre_mm + self.skin_apex_mm * self.axis
+
+    @property
+    def across_in_sensor(self) -> np.ndarray:
+        """``across`` (3,) in the sensor frame."""
+        return np.array([np.cos(np.radians(self.image_turn_deg)), np.sin(np.radians(self.image_turn_deg)), 0.0])
+
+    @property
+    def tool_point_mm(self) -> np.ndarray:
+        """The tool point (3,) in the sensor frame."""
+        frame = np.stack([self.axis, self.across, np.cross(self.axis, self.across)])
+        here = np.stack([_SENSOR_AXIS, self.across_in_sensor, np.cross(_SENSOR_AXIS, self.across_in_sensor)])
+        return -(frame @ self.centre_mm) @ here
+
+    @property
+    def work_axes(self) -> np.ndarray:
+        """Axes (3, 3) of the frame in which tasks and policies move a tool, as columns in the tool frame: x ``across``, z ``axis``."""
+        return np.column_stack([self.across, np.cross(self.axis, self.across), self.axis])
+
+    @property
+    def T_tool_sensor(self) -> np.ndarray:
+        """Pose (4, 4) of the sensor frame in the tool frame, mm."""
+        turn = np.radians(self.image_turn_deg)
+        side = np.cross(self.axis, self.across)  # direction whose azimuth in the sensor frame is 90 deg larger than that of ``across``
+        T = np.eye(4)
+        T[:3, 0] = np.cos(turn) * self.across - np.sin(turn) * side
+        T[:3, 1] = np.sin(turn) * self.across + np.cos(turn) * side
+        T[:3, 2] = self.axis
+        T[:3, 3] = self.centre_mm
+        return T
+
+    @property
+    def label_turn(self) -> np.ndarray:
+        """Axis (3,) in the sensor frame about which the tool rotates, right-handed, when the label of the angle increases."""
+        return self.angle_sign * np.cross(self.across_in_sensor, _SENSOR_AXIS)
+
+    @classmethod
+    def of(cls, sensor: SensorSpec, experiment: ExperimentSpec) -> "Mounting":
+        """The mounting of a sensor on its own rig."""
+        return cls(rig_of(sensor), experiment, sensor.skin)
+
+    def depth_mm(self, label: Number) -> Number:
+        """Depth from the first touch on for a label of the depth."""
+        return label + self.zero_mm
+
+    def angle_deg(self, label: Number) -> Number:
+        """Angle from the surface's normal for a label of the angle."""
+        return self.angle_sign * (label - self.zero_deg)
+
+    def labels(self, depth_mm: Number, angle_deg: Number) -> tuple[Number, Number]:
+        """Labels of the depth and of the angle for a given depth and angle."""
+        return depth_mm - self.zero_mm, self.zero_deg + self.angle_sign * angle_deg
+
+
 def object_pose(rig: RigSpec, experiment: ExperimentSpec, pose: np.ndarray, apex_mm: float) -> np.ndarray:
     """``T_sensor_object`` (4, 4) for a pose (6,) of the arm in mm and deg; ``apex_mm`` is the z of the skin's apex."""
-    unturned = _UNTURNED[experiment.approach]
+    axis, across = np.array(_DIRECTIONS[experiment.approach], float)
+    unturned = np.column_stack([across, np.cross(axis, across), axis])  # the sensor's x, y and z in the work frame
     turn = tool_turn(rig, pose)
     centre = pose[:3] + turn @ unturned @ [rig.tcp_lateral_mm, rig.tcp_binormal_mm, rig.tcp_to_dome_mm]
     height_mm = apex_mm + rig.tcp_to_dome_mm - experiment.zero_mm - rig.contact_offset_mm
@@ -96,10 +194,7 @@ def object_pose(rig: RigSpec, experiment: ExperimentSpec, pose: np.ndarray, apex
 
 def tool_turn(rig: RigSpec, pose: np.ndarray) -> np.ndarray:
     """Rotation (3, 3) of the tool in the work frame for a pose (6,) of the arm in mm and deg."""
-    turn: np.ndarray = Rotation.from_euler(
-        "xyz", rig.turn_sign * (np.asarray(pose[3:], float) + rig.turn_offset_deg), degrees=True
-    ).as_matrix()
-    return turn
+    return Rotation.from_euler("xyz", rig.turn_sign * (np.asarray(pose[3:], float) + rig.turn_offset_deg), degrees=True).as_matrix()
 
 
 def arm_path(rig: RigSpec, experiment: ExperimentSpec, skin: SkinSpec, field: ObjectField, label: ArmLabel) -> ArmPath:
@@ -124,7 +219,15 @@ def arm_path(rig: RigSpec, experiment: ExperimentSpec, skin: SkinSpec, field: Ob
     tapped = np.asarray(label.pose, float) - label.move
     if experiment.tap_frame == "tool":
         tap = np.concatenate([tool_turn(rig, tapped) @ tap[:3], tap[3:]])
-    share, touches = _first_touch(field, at(tapped - tap), at(tapped), shape.outside(shape.even(TOUCH_POINTS)))
+    skin_mm, start = shape.outside(shape.even(SKIN_POINTS)), at(tapped - tap)
+    way = at(tapped)[:3, 3] - start[:3, 3]
+
+    def gaps_at(share: float) -> np.ndarray:
+        return field.distance((skin_mm - start[:3, 3] - share * way) @ start[:3, :3])
+
+    too_late = f"the object is in the sensor's way {CLEAR_MM:g} mm before the tap; begin it elsewhere"
+    share, _ = march_to_touch(gaps_at, 0.0, 1.0, too_late, unit_mm=float(np.linalg.norm(way)))
+    touches, share = share <= 1, min(share, 1.0)
     still = np.zeros(6)
     labels = [ArmLabel(tapped - (1 - share) * tap, still), ArmLabel(tapped, still)]
     if label.executed:
@@ -133,29 +236,3 @@ def arm_path(rig: RigSpec, experiment: ExperimentSpec, skin: SkinSpec, field: Ob
     if not touches:
         labels = labels[1:] if len(labels) > 2 else [replace(labels[1], pose=tapped - tap), labels[1]]
     return ArmPath(ContactPath(np.stack([at(each.pose) for each in labels])), labels, touches)
-
-
-def _first_touch(field: ObjectField, start: np.ndarray, stop: np.ndarray, skin_mm: np.ndarray) -> tuple[float, bool]:
-    """Fraction of the straight path between two poses at which the object first touches the skin, and whether it touches at all.
-
-    The object advances again and again by its smallest distance to the skin. If distances are exact, it never passes the first touch
-    (sphere tracing, Hart 1996).
-    """
-    turn, way = start[:3, :3], stop[:3, 3] - start[:3, 3]
-    length_mm = float(np.linalg.norm(way))
-    share = 0.0
-    free: float | None = None  # the largest fraction without contact so far
-    for _ in range(MOST_MARCHES):
-        gap_mm = float(field.distance((skin_mm - start[:3, 3] - share * way) @ turn).min())
-        if abs(gap_mm) <= TOUCH_TOLERANCE_MM:
-            return share, True
-        if gap_mm < 0:
-            if free is None:
-                raise ContactError(f"the object is in the sensor's way {CLEAR_MM:g} mm before the tap; begin it elsewhere")
-            share = (share + free) / 2  # the distance was too large, which happens near wires and far from a mesh: go back half of the step
-            continue
-        free = share
-        share += gap_mm / length_mm
-        if share >= 1:
-            return 1.0, False
-    return free or 0.0, True

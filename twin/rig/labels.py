@@ -57,11 +57,8 @@ def read_arm_labels(recording: Recording, experiment: ExperimentSpec | None = No
         If there is no table, if it has no column of a pose or lacks one that the experiment varies, or if a cell of a pose or move is not a
         number.
     """
-    columns = {
-        kind: [(axis, recording.labels[f"{kind}_{axis}"]) for axis in range(1, 7) if f"{kind}_{axis}" in recording.labels]
-        for kind in ("pose", "move")
-    }
-    if not columns["pose"]:
+    names = [f"{kind}_{axis}" for kind in ("pose", "move") for axis in range(1, 7)]
+    if not any(name in recording.labels for name in names[:6]):
         found = recording.labels_found()
         raise FrameError(f"{recording.path}: no labels pose_1..6 ({found}); targets.csv with them is expected beside the frames")
     varied = [] if experiment is None else [name for name, (low, high) in experiment.pose.model_dump().items() if high > low]
@@ -70,14 +67,13 @@ def read_arm_labels(recording: Recording, experiment: ExperimentSpec | None = No
             f"{recording.path}: no label {', '.join(missing)}, which the experiment {experiment.name} varies ({recording.labels_found()}); "
             "add the column, or give the experiment that the frames were recorded with (`experiment`)"
         )
-    values = {kind: np.zeros((len(recording), 6)) for kind in columns}
-    for kind, named in columns.items():
-        for axis, cells in named:
-            values[kind][:, axis - 1] = numbers(cells)
-    odd = ~np.isfinite(np.hstack([values["pose"], values["move"]])).all(axis=1)
+    none = np.zeros(len(recording))
+    values = {name: numbers(recording.labels[name]) if name in recording.labels else none for name in names}
+    table = np.column_stack(list(values.values()))
+    odd = ~np.isfinite(table).all(axis=1)
     if odd.any():
-        names = [recording.names[k] for k in np.flatnonzero(odd)[:3]]
-        raise FrameError(f"{recording.path}: rows without a number in a pose or move ({', '.join(names)}); repair or remove them")
+        shown = ", ".join(recording.names[k] for k in np.flatnonzero(odd)[:3])
+        raise FrameError(f"{recording.path}: rows without a number in a pose or move ({shown}); repair or remove them")
     if experiment is not None and (fixed := _varied_beyond(experiment, values)):
         recording.problems.append(
             f"{', '.join(fixed)} varies in the table, and not in the experiment {experiment.name}: what is simulated by this experiment "
@@ -85,7 +81,7 @@ def read_arm_labels(recording: Recording, experiment: ExperimentSpec | None = No
         )
     executed = read_executed(Path(recording.path), recording.names, recording.problems)
     done = [executed.get(name, 1.0) > 0.5 for name in recording.names]
-    return [ArmLabel(*row) for row in zip(values["pose"], values["move"], done, strict=True)]
+    return [ArmLabel(*row) for row in zip(table[:, :6], table[:, 6:], done, strict=True)]
 
 
 def as_executed(pose: np.ndarray, move: np.ndarray, executed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -104,10 +100,9 @@ def poses_and_moves(labels: Sequence[ArmLabel]) -> tuple[np.ndarray, np.ndarray]
 
 
 def _varied_beyond(experiment: ExperimentSpec, values: dict[str, np.ndarray]) -> list[str]:
-    """Names of the labels that vary in a table (``values``: (M, 6) for each kind), although the experiment keeps them constant."""
+    """Names of the labels that vary in a table (``values``: (M,) for each label), although the experiment keeps them constant."""
     ranges = experiment.ranges()
-    named = {f"{kind}_{axis + 1}": each[:, axis] for kind, each in values.items() for axis in range(6)}
-    return [name for name, each in named.items() if ranges[name][0] == ranges[name][1] and np.ptp(each) > HELD]
+    return [name for name, each in values.items() if ranges[name][0] == ranges[name][1] and np.ptp(each) > HELD]
 
 
 def plate_slope(rig: RigSpec | None) -> float:
@@ -188,12 +183,5 @@ def _pair_shares(file: str, listed: list[str], shares: list[float], names: Seque
 def _share(cell: str) -> float:
     """Value of a cell from 0 (not executed) to 1 (executed); NaN if the cell is not such a value."""
     text = cell.strip().casefold()
-    if text in ("true", "yes"):
-        return 1.0
-    if text in ("false", "no"):
-        return 0.0
-    try:
-        share = float(text)
-    except ValueError:
-        return float("nan")
+    share = float(numbers(np.array([{"true": "1", "yes": "1", "false": "0", "no": "0"}.get(text, text)]))[0])
     return share if 0 <= share <= 1 else float("nan")

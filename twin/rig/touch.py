@@ -18,7 +18,7 @@ from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
 from scenes.rig import RigSpec
 from twin.objects import build_field
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting
 
 OUTLINE_STEP_MM = 0.5
 """Distance between two points of an outline."""
@@ -143,9 +143,8 @@ def tilted_labels(
     turn_of_object, centre_mm = T_sensor_object[:3, :3], -T_sensor_object[:3, :3].T @ T_sensor_object[:3, 3]
     distance_mm, outward, _ = surface.field.probe(centre_mm[None])
     in_image = Rotation.from_euler("z", -rig.image_turn_deg, degrees=True)
-    seen = in_image.apply(
-        -turn_of_object @ outward[0]
-    )  # the plate's normal, into the object, in the sensor frame without the rotation of the image
+    # the plate's normal, into the object, in the sensor frame without the rotation of the image
+    seen = in_image.apply(-turn_of_object @ outward[0])
     plate = Rotation.from_euler("y", -rig.plate_tilt_deg, degrees=True).apply([0.0, 0.0, 1.0])
     about_z = Rotation.from_euler("z", rig.turn_sign * rig.turn_offset_deg[2], degrees=True)
     unspun = about_z.inv().apply(plate)

@@ -43,8 +43,7 @@ def static_light(spec: SensorSpec) -> tuple[FloatArray, FloatArray]:
     """Light and cover of the whole raw frame that no contact changes (``static_layer``). The result is stored for later runs."""
 
     def compute() -> dict[str, np.ndarray]:
-        light, cover = static_layer(spec, (0, 0, spec.camera.width_px, spec.camera.height_px))
-        return {"light": light, "cover": cover}
+        return dict(zip(("light", "cover"), static_layer(spec, (0, 0, spec.camera.width_px, spec.camera.height_px)), strict=True))
 
     kept = cached_arrays("static-light", {"sensor": spec.model_dump(mode="json")}, compute, code=(static_layer,))
     return kept["light"], kept["cover"]

@@ -8,14 +8,14 @@ import time
 from collections import deque
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 
-from scenes import list_experiments, load_experiment
+from scenes import list_specifications, load_experiment
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
-from twin.camera.projection import project_in_form
 from twin.errors import ContactError
 from twin.estimate import Estimate, SensorModel, pins_in
 from twin.geometry.solid import Resolution
@@ -25,8 +25,7 @@ from twin.mechanics.path import ContactPath, deepest_mm
 from twin.mechanics.solver import SkinSolver
 from twin.objects import build_field
 from twin.pins import Pipeline
-from twin.rig.kinematics import rig_of
-from twin.rig.mounting import Mounting
+from twin.rig.kinematics import Mounting, rig_of
 from twin.rig.touch import SmoothSurface, surface_labels, tilted_labels
 from twin.studio.camera import StudioCamera
 from twin.studio.pose import ObjectPose, bend_mm, motion_mm
@@ -88,12 +87,8 @@ class ContactAnswer:
     state : ContactState
     light : (h, w) or (h, w, 3) float
         Linear light of the dome's part of the frame.
-    raw : Frame
-        The whole raw frame.
     frame, seen : Frame, Observation
         The frame in the form that is shown, and the pipeline's observation of it.
-    caps_px : (N, 2) float
-        Positions of the caps in that frame.
     estimate : Estimate or None
         None without a model.
     labels : dict of str to float
@@ -115,10 +110,8 @@ class ContactAnswer:
     indent_mm: float
     state: ContactState
     light: FloatArray
-    raw: Frame
     frame: Frame
     seen: Observation
-    caps_px: FloatArray
     estimate: Estimate | None
     labels: dict[str, float]
     lit: Light
@@ -186,6 +179,7 @@ class MovingContact:
         self.pose = ObjectPose()
         self._last: ContactAnswer | None = None
         self._take_up(setup)
+        self.restart()
         if model is not None:
             self.use(model)
 
@@ -201,38 +195,31 @@ class MovingContact:
         self.model = model
         self._experiment = experiment_of(model)
 
-    def change(self, *, obj: ObjectSpec | None = None, friction: float | None = None, form: Form | None = None) -> None:
-        """Use another object, friction or form of the frames. Arguments that are not given stay as they are. A contact starts again.
+    def change(self, **given: Any) -> None:
+        """Use another ``obj``, ``friction`` or ``form`` of the frames. With another object or friction the contact starts again.
 
         Another object has its own friction until a friction is given again.
+
+        Raises
+        ------
+        FrameError
+            The sensor has no such form.
         """
-        setup = self.setup
-        if obj is not None:
-            setup = replace(setup, obj=obj, friction=None)
-        if friction is not None:
-            setup = replace(setup, friction=friction)
-        if form is not None:
-            setup = replace(setup, form=form)
-        if setup.form is Form.PROCESSED and setup.sensor.recording is None:
-            self.camera.as_recorded(Frame(np.zeros((1, 1), np.uint8), Form.RAW))  # raises the error that there is no such form
-        pressed_anew = setup.obj != self.setup.obj or setup.friction != self.setup.friction
-        if pressed_anew:
-            self._take_up(setup)
-        else:
-            self.setup, self._pipeline = setup, Pipeline(setup.sensor, setup.form)
+        old = self.setup
+        self._take_up(replace(old, **({"friction": None} if "obj" in given else {}) | given))
+        if (old.obj, old.friction) != (self.setup.obj, self.setup.friction):
+            self.restart()
 
     def _take_up(self, setup: ContactSetup) -> None:
+        self._pipeline = Pipeline(setup.sensor, setup.form)
         self._surface, self._field = SmoothSurface(setup.obj), build_field(setup.obj)
         self.setup = setup
-        self._pipeline = Pipeline(setup.sensor, setup.form)
-        self.restart()
 
     def restart(self) -> None:
         """Forget the contact and its friction. The next move presses the object straight down to its pose."""
         self._follower = Follower(self.solver, self.setup.obj, self.setup.law)
         self._T: FloatArray | None = None
-        self._blocked: FloatArray | None = None
-        self._why_blocked = ""
+        self._blocked = False  # whether the last step had no solution
         self._fine: Follower | None = None
         self._fine_T: FloatArray | None = None
         self.fine_lost = ""  # why this contact has no answer on the fine mesh; "" if it has one or may still get one
@@ -251,9 +238,7 @@ class MovingContact:
             limit = deepest_mm(self.setup.sensor.geometry)
             return f"it would be more than {limit:.1f} mm inside the skin, which is half the gel's depth"
         gap_mm, place = self._follower.nearest(T)
-        if gap_mm >= 0:
-            return ""
-        if place[2] < self.setup.sensor.skin.rim_z_mm + RIM_MARGIN_MM:
+        if gap_mm < 0 and place[2] < self.setup.sensor.skin.rim_z_mm + RIM_MARGIN_MM:
             return "it would press beyond the rim, where the skin is clamped"
         return ""
 
@@ -286,10 +271,6 @@ class MovingContact:
             depth_mm += gap_mm
         return 0.0
 
-    def _is_there(self, goal: FloatArray) -> bool:
-        near = (T for T in (self._T, self._blocked) if T is not None)
-        return any(np.abs(T - goal).max() < SAME_MM for T in near)
-
     def _next(self, goal: FloatArray) -> FloatArray:
         """The next pose (4, 4) on the straight path to a goal: one load step further in contact, else as far as nothing touches."""
         if self._T is None:
@@ -314,18 +295,17 @@ class MovingContact:
         try:
             state = self._follower.move(T, now)
         except ContactError as error:
-            self._blocked, self._why_blocked = goal, f"the object stays here: {error}"
+            self._blocked = True
             if self._last is None:
                 raise
             self._count += 1
-            self._last = replace(self._last, number=self._count, arrived=True, stopped=self._why_blocked)
+            self._last = replace(self._last, number=self._count, arrived=True, stopped=f"the object stays here: {error}")
             return self._last
         self._store_path(T)
         self._solved += 1
         solved_ms = 1e3 * (time.perf_counter() - started)
-        arrived = self._is_there(goal)
-        stopped = (self._why_blocked if self._blocked is not None and np.array_equal(self._blocked, goal) else reason) if arrived else ""
-        return self._answer(T, state, SolvedMesh.USUAL, arrived=arrived, stopped=stopped, ms={"contact": solved_ms})
+        arrived = bool(np.abs(T - goal).max() < SAME_MM)
+        return self._answer(T, state, SolvedMesh.USUAL, arrived=arrived, stopped=reason if arrived else "", ms={"contact": solved_ms})
 
     def newest_traced(self, solved: int, light: FloatArray, lit: Light, traced_ms: float) -> ContactAnswer | None:
         """The newest answer with path-traced light (h, w) or (h, w, 3) of a contact; None if a newer contact was solved since."""
@@ -382,8 +362,8 @@ class MovingContact:
 
     def _store_path(self, T: FloatArray) -> None:
         """Store the path for the fine mesh. A contact's path begins at the last free pose, or where the contact was started again."""
-        begun_anew = self._T is None or self._blocked is not None or self._follower.restarts != self._restarts
-        self._blocked, self._refined, self._restarts = None, False, self._follower.restarts
+        begun_anew = self._T is None or self._blocked or self._follower.restarts != self._restarts
+        self._blocked, self._refined, self._restarts = False, False, self._follower.restarts
         if begun_anew or self._follower.gap_mm(T) >= 0:
             self._way.clear()
             self._fine, self._fine_T, self.fine_lost = None, None, ""
@@ -408,22 +388,23 @@ class MovingContact:
         started = time.perf_counter()
         light, lit = traced or (self.camera.draw(state), Light.RASTERISED)
         raw = self.camera.raw(light, seed=self._count)
-        now = time.perf_counter()
-        needs_recorded = self.setup.form is Form.PROCESSED or (self.model is not None and self.model.form is Form.PROCESSED)
-        frames = {Form.RAW: raw} | ({Form.PROCESSED: self.camera.as_recorded(raw)} if needs_recorded else {})
-        frame = frames[self.setup.form]
-        estimate = None if self.model is None else self.model(frames[self.model.form])
-        estimated = time.perf_counter()
-        of_frame = self.model is not None and self.model.form is self.setup.form
-        seen = pins_in(frame, estimate if of_frame else None, self._pipeline)
-        times = {"picture": now - started, "estimate": estimated - now, "pins": time.perf_counter() - estimated}
-        true_px = project_in_form(self.setup.sensor, self.setup.form, state.caps_mm)
+        drawn = time.perf_counter()
+        frame, estimate, seen = self.observe(raw, self.setup.form, self._pipeline)
+        times = {"picture": drawn - started, "estimate and pins": time.perf_counter() - drawn}
         labels = self.labels(state.T_sensor_object if len(state.contact_mm) else T)
         self._last = ContactAnswer(
-            self.setup, self._count, self._solved, ObjectPose.of(T, self._apex_mm), -self._follower.gap_mm(T), state, light, raw, frame,
-            seen, true_px, estimate, labels, lit, mesh, arrived, stopped, ms | {name: 1e3 * value for name, value in times.items()},
+            self.setup, self._count, self._solved, ObjectPose.of(T, self._apex_mm), -self._follower.gap_mm(T), state, light, frame, seen,
+            estimate, labels, lit, mesh, arrived, stopped, ms | {name: 1e3 * value for name, value in times.items()},
         )  # fmt: skip
         return self._last
+
+    def observe(self, raw: Frame, form: Form, pipeline: Pipeline) -> tuple[Frame, Estimate | None, Observation]:
+        """A raw frame in a form, the model's estimate (None without a model), and the pins that the pipeline finds in that form."""
+        model = self.model
+        frames = {each: raw if each is Form.RAW else self.camera.as_recorded(raw) for each in {form, form if model is None else model.form}}
+        estimate = None if model is None else model(frames[model.form])
+        of_frame = model is not None and model.form is form
+        return frames[form], estimate, pins_in(frames[form], estimate if of_frame else None, pipeline)
 
     def labels(self, T: FloatArray) -> dict[str, float]:
         """The true values of the model's labels with the object at ``T`` (4, 4), as far as they are defined; empty without a model."""
@@ -432,8 +413,7 @@ class MovingContact:
             return {}
         flat = surface_labels(experiment, Mounting.of(sensor, experiment), self._surface, T[None])
         known = {name: float(value[0]) for name, value in flat.items()}
-        known |= tilted_labels(rig_of(sensor), experiment, self._surface, self._apex_mm, T) if not known else {}
-        return known
+        return known or tilted_labels(rig_of(sensor), experiment, self._surface, self._apex_mm, T)
 
 
 def experiment_of(model: SensorModel) -> ExperimentSpec | None:
@@ -442,7 +422,7 @@ def experiment_of(model: SensorModel) -> ExperimentSpec | None:
     Its axes and its zero define the labels.
     """
     names = set(getattr(model, "names", ()))
-    for name in sorted(list_experiments()):
+    for name in sorted(list_specifications("experiments")):
         experiment = load_experiment(name)
         if set(experiment.targets) == names and experiment.object == "plane":
             return experiment

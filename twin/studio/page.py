@@ -1,6 +1,7 @@
-"""The page: server, panels, pictures, numbers, charts, and the choice of the mode."""
+"""The page: server, panels, pictures, numbers, charts, uploaded files, and the choice of the mode."""
 
 import errno
+import re
 import socket
 import time
 from collections import deque
@@ -8,11 +9,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, redirect_stdout
 from http import HTTPStatus
-from io import StringIO
+from io import BytesIO, StringIO
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 from urllib.parse import urlsplit
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 import viser
@@ -25,14 +27,16 @@ from websockets.http11 import Request, Response
 from scenes.base import SpecError
 from scenes.files import quote
 from twin.errors import TwinError
+from twin.store import writing
 from twin.studio.pictures import PAGE, numbers_html, paragraph
-from twin.studio.uploads import keep_upload
+from twin.studio.state import next_path
 from twin.types import ImageArray
 
 if TYPE_CHECKING:
     from twin.studio.modes.mode import PageMode
 
 Value = TypeVar("Value")
+Control = TypeVar("Control", bound=viser.GuiInputHandle[Any])
 
 LOCAL = ("127.0.0.1", "localhost", "::1")
 """Hosts that only this machine reaches."""
@@ -56,6 +60,8 @@ CHART_PX = 170
 """Height of a chart, px."""
 LINES = ("#4dabf7", "#ff922b", "#51cf66", "#f06595", "#ffd43b", "#845ef7")
 """Colours of a chart's lines."""
+MOST_UNPACKED_GB = 4
+"""Largest size of the content of an uploaded archive."""
 CHANGE_S = 10.0
 """Longest wait, s, for changes of the page."""
 
@@ -168,6 +174,32 @@ def free_port(host: str, port: int) -> int:
     raise OSError(errno.EADDRINUSE, f"no port from {port} on is free")
 
 
+def keep_upload(folder: Path, name: str, content: bytes) -> Path:
+    """Store an uploaded file in a new folder ``upload-NUMBER``, and return its path. An archive is unpacked: the path is its folder's.
+
+    Raises
+    ------
+    TwinError
+        The archive is damaged or too large, or nothing can be written.
+    """
+    safe = re.sub(r"[^\w.-]+", "_", name).lstrip(".") or "file"
+    place = next_path(folder, "upload", "")
+    with writing(place):
+        place.mkdir()
+        if not safe.lower().endswith(".zip"):
+            (place / safe).write_bytes(content)
+            return place / safe
+        try:
+            with ZipFile(BytesIO(content)) as archive:
+                if sum(each.file_size for each in archive.infolist()) > 1e9 * MOST_UNPACKED_GB:
+                    raise TwinError(f"{safe}: more than {MOST_UNPACKED_GB} GB unpacked; give the folder's path on the studio's machine")
+                archive.extractall(place)  # never writes outside of the folder
+        except (BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
+            raise TwinError(f"{safe}: no readable archive ({error}); upload a .zip of a folder of frames") from error
+    inside = list(place.iterdir())
+    return inside[0] if len(inside) == 1 and inside[0].is_dir() else place
+
+
 class LineChart:
     """Chart of lines over the last seconds. It appears with its first values.
 
@@ -211,9 +243,7 @@ class LineChart:
     def _draw_anew(self) -> None:
         if self._plot is not None:
             self._plot.remove()
-        lines: list[uplot.Series] = [
-            {"label": name, "stroke": colour, "width": 2} for name, colour in zip(self._names, LINES, strict=False)
-        ]
+        lines: list[uplot.Series] = [{"label": name, "stroke": rgb, "width": 2} for name, rgb in zip(self._names, LINES, strict=False)]
         faint: uplot.Axis_Grid = {"stroke": "#8a93a333", "width": 1}
         axis: uplot.Axis = {"stroke": "#8a93a3", "size": 50, "grid": faint, "ticks": {**faint, "size": 4}}
         with self._page.charts_tab:
@@ -271,9 +301,8 @@ class StudioPage:
         with pictures.add_tab("Camera"):
             self._absent = gui.add_html("")
             empty = np.zeros((8, 8, 3), np.uint8)
-            self._camera, self._cells = (
-                gui.add_image(empty, label="", format="jpeg", jpeg_quality=JPEG_QUALITY, visible=False) for _ in range(2)
-            )
+            shown = [gui.add_image(empty, label="", format="jpeg", jpeg_quality=JPEG_QUALITY, visible=False) for _ in range(2)]
+            self._camera, self._cells = shown
         self.charts_tab = pictures.add_tab("Charts")
         with self.charts_tab:  # PAGE hides this beside a chart
             none = "There is no chart. Forces and estimates of the modes Twin and Live give charts."
@@ -378,6 +407,11 @@ class StudioPage:
 
         return call_action
 
+    def watch(self, control: Control, action: Callable[[], object]) -> Control:
+        """Call an action (see ``guard``) at each change of a control, which is returned."""
+        control.on_update(self.guard(action))
+        return control
+
     def button(self, label: str, action: Callable[[], object], **options: Any) -> None:
         """Add a button that calls an action (see ``guard``)."""
         self.gui.add_button(label, **options).on_click(self.guard(action))
@@ -386,6 +420,10 @@ class StudioPage:
         """Add a button for a file of some kinds (".stl,.obj"); ``take`` is called with the path at which it is stored."""
         button = self.gui.add_upload_button(label, mime_type=kinds, hint=hint)
         button.on_upload(self.guard(lambda: take(str(keep_upload(self._saves, button.value.name, button.value.content)))))
+
+    def upload_frames(self, take: Callable[[str], object]) -> None:
+        """Add a button for frames, as ``upload`` does; an archive is unpacked."""
+        self.upload("Upload frames (zip or video)", ARCHIVES, take, hint="or drop a folder, an archive or a video on the page")
 
     def say(self, text: str, *, bad: bool = False) -> None:
         """Show a message for some seconds."""

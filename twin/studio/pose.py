@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from twin.errors import ContactError
 from twin.mechanics.path import carry_points
+from twin.rig.arm_pose import matrix_of
 from twin.types import FloatArray
 
 LIMITS: dict[str, tuple[float, float, str]] = {
@@ -40,10 +41,7 @@ class ObjectPose:
 
     def matrix(self, apex_mm: float) -> FloatArray:
         """``T_sensor_object`` (4, 4) for a skin whose apex is at the height ``apex_mm``."""
-        T = np.eye(4)
-        T[:3, :3] = Rotation.from_euler("xyz", [self.tilt_x_deg, self.tilt_y_deg, self.twist_deg], degrees=True).as_matrix()
-        T[:3, 3] = self.x_mm, self.y_mm, apex_mm - self.depth_mm
-        return T
+        return matrix_of(np.array([self.x_mm, self.y_mm, apex_mm - self.depth_mm, self.tilt_x_deg, self.tilt_y_deg, self.twist_deg]))
 
     @classmethod
     def of(cls, T: FloatArray, apex_mm: float) -> "ObjectPose":
@@ -68,10 +66,6 @@ class ObjectPose:
             if kept[name] != value:
                 reasons.append(f"{readable_name(name)} is limited to {kept[name]:g} {unit_of(name)}: {why}")
         return ObjectPose(**kept), "; ".join(reasons)
-
-    def words(self) -> str:
-        """All six numbers with their units."""
-        return ", ".join(f"{readable_name(name)} {value:+.2f} {unit_of(name)}" for name, value in asdict(self).items())
 
 
 @dataclass(frozen=True)

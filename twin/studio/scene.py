@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
@@ -17,9 +16,9 @@ from scenes.object import ObjectSpec
 from scenes.sensor import PinsSpec, SensorSpec
 from twin.geometry.mesh import SensorMesh
 from twin.objects import build_field
-from twin.optics.surfaces import lathe
+from twin.optics.surfaces import PaintedSurface, lathe
 from twin.report.skin3d import object_surface
-from twin.types import ContactState, FloatArray, IntArray, PinState
+from twin.types import ContactState, FloatArray, PinState
 
 FINER = 2
 """Number of parts along each side of a mesh element in the drawn skin."""
@@ -38,6 +37,9 @@ NEAR_FOOT_MM = 2.5
 HOLDER_MM = 14.0
 """Height of the drawn holder, mm."""
 SKIN_RGB, OBJECT_RGB, HOLDER_RGB, FORCE_RGB = (128, 146, 184), (120, 168, 232), (78, 85, 98), (255, 176, 32)
+UNSHADED: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
+SURFACE: dict[str, Any] = {"side": "double", **UNSHADED}
+"""How solids and surfaces are drawn."""
 GIZMO_MM = 16.0
 """Size of the gizmo, mm."""
 GLOW = cv2.applyColorMap(np.linspace(0.22 * 255, 0.97 * 255, 256).astype(np.uint8)[:, None], cv2.COLORMAP_INFERNO)[:, 0, ::-1]
@@ -56,14 +58,6 @@ FULL_SCALE = {PinColour.DISPLACEMENT: (4.0, "mm"), PinColour.PRESSURE: (0.05, "M
 """Value with the brightest colour, and its unit."""
 
 
-@dataclass(frozen=True)
-class TriangleMesh:
-    """A triangle mesh: vertices (v, 3) in mm and faces (f, 3)."""
-
-    corners_mm: FloatArray
-    faces: IntArray
-
-
 class SmoothSkin:
     """The outer skin's surface, smoothly interpolated between the nodes of the mesh.
 
@@ -80,11 +74,11 @@ class SmoothSkin:
         index = np.arange(high * wide).reshape(high, wide)
         quads = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]], axis=-1).reshape(-1, 4)
         faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-        self.rest = TriangleMesh(self.corners(mesh.nodes_mm), faces)
-        corners = self.rest.corners_mm[faces]
+        self.rest = PaintedSurface(self.corners(mesh.nodes_mm), faces)
+        corners = self.rest.vertices_mm[faces]
         outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         if np.median((outward * corners.mean(axis=1)).sum(axis=1)) < 0:
-            self.rest = TriangleMesh(self.rest.corners_mm, faces[:, ::-1])
+            self.rest = PaintedSurface(self.rest.vertices_mm, faces[:, ::-1])
 
     def corners(self, nodes_mm: FloatArray) -> FloatArray:
         """Vertices (v, 3) float32 for nodes (n, 3) of the mesh."""
@@ -139,13 +133,12 @@ def matrix(wxyz: FloatArray, position: FloatArray) -> FloatArray:
     return T
 
 
-def pin_shape(pins: PinsSpec) -> TriangleMesh:
+def pin_shape(pins: PinsSpec) -> PaintedSurface:
     """A pin that points along -z, with the centre of its cap at the origin; stem and cap are tubes."""
     half, length = pins.cap_height_mm / 2, pins.length_mm + pins.cap_height_mm / 2
     stem, cap = pins.diameter_mm / 2, pins.cap_diameter_mm / 2
     profile = np.array([[stem, -length], [stem, -half], [cap, -half], [cap, half], [0, half]])
-    body = lathe(profile, np.zeros((1, 3)), np.array([[0.0, 0.0, -1.0]]), SIDES)
-    return TriangleMesh(body.vertices_mm, body.faces)
+    return lathe(profile, np.zeros((1, 3)), np.array([[0.0, 0.0, -1.0]]), SIDES)
 
 
 class PinScene:
@@ -155,35 +148,31 @@ class PinScene:
     ----------
     server : viser.ViserServer
     sensor : SensorSpec
-    skin : Surface
+    skin : PaintedSurface
         The skin at rest.
     rest : PinState
     """
 
-    def __init__(self, server: viser.ViserServer, sensor: SensorSpec, skin: TriangleMesh, rest: PinState) -> None:
+    def __init__(self, server: viser.ViserServer, sensor: SensorSpec, skin: PaintedSurface, rest: PinState) -> None:
         radius_mm, pin = max(sensor.skin.half_size_mm), pin_shape(sensor.pins)
-        shadows: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
         self._scene = server.scene
         self._scene.configure_environment_map(None)
         self._scene.configure_default_lights(enabled=True, cast_shadow=False)
         self._scene.add_light_ambient("/light", intensity=2.0)
         server.initial_camera.position = (1.2 * radius_mm, -3.4 * radius_mm, 1.7 * radius_mm)
         server.initial_camera.look_at = (0.0, 0.0, 0.7 * sensor.skin.apex_mm)
-        self._skin = self._scene.add_mesh_simple(
-            "/sensor/skin", skin.corners_mm, skin.faces, color=SKIN_RGB, opacity=0.45, side="double", **shadows
-        )
+        self._skin = self._scene.add_mesh_simple("/sensor/skin", skin.vertices_mm, skin.faces, color=SKIN_RGB, opacity=0.45, **SURFACE)
         self._pins = self._scene.add_batched_meshes_simple(
             "/sensor/pins",
-            pin.corners_mm,
+            pin.vertices_mm,
             pin.faces,
             turns_to(rest.axis),
             rest.caps_mm.astype(np.float32),
             batched_colors=colours(np.zeros(len(rest.caps_mm)), PinColour.DISPLACEMENT),
             lod="off",
-            side="double",
-            **shadows,
+            **SURFACE,
         )
-        place = {"color": HOLDER_RGB, "position": (0.0, 0.0, sensor.skin.rim_z_mm - HOLDER_MM / 2 - 0.05)} | shadows
+        place = {"color": HOLDER_RGB, "position": (0.0, 0.0, sensor.skin.rim_z_mm - HOLDER_MM / 2 - 0.05)} | UNSHADED
         if sensor.skin.shape == "rectangular-pad":
             across, along = (2.04 * half for half in sensor.skin.half_size_mm)
             self._scene.add_box("/sensor/holder", dimensions=(across, along, HOLDER_MM), **place)
@@ -199,9 +188,7 @@ class PinScene:
         """Show another object, or another part of it: that in a box (x0, x1, y0, y1, z0, z1) of its frame."""
         surface = object_surface(build_field(obj).distance, np.eye(4), bounds_mm=bounds_mm, samples=OBJECT_SAMPLES).triangulate()
         corners, faces = np.asarray(surface.points, np.float32), np.asarray(surface.regular_faces)
-        self._object = self._scene.add_mesh_simple(
-            "/object", corners, faces, color=OBJECT_RGB, opacity=0.35, side="double", cast_shadow=False, receive_shadow=False
-        )
+        self._object = self._scene.add_mesh_simple("/object", corners, faces, color=OBJECT_RGB, opacity=0.35, **SURFACE)
 
     def show_pins(self, pins: PinState, skin_mm: FloatArray, colour: np.ndarray) -> None:
         """Show pins with their colours (N, 3) uint8, and the skin's vertices (v, 3)."""

@@ -6,13 +6,14 @@ import json
 from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Annotated
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from scenes import load_object, load_sensor
-from scenes.base import NonNegative, Section, SpecError
+from scenes.base import NonNegative, Section, SpecError, problem_text
 from scenes.files import read_regular
 from twin.errors import ErrorsAs, TwinError, format_count
 from twin.store import text_file, write_json, writing
@@ -50,7 +51,7 @@ class StudioState(Section):
         Value that replaces the object's own friction.
     pose : dict of str to float
         The object's six numbers (``ObjectPose``).
-    form, colour, drawn : str
+    form, colour, drawn : Form, PinColour, OverlayChoices
         The frame's form, the quantity that the pins' colours show, and what is drawn over the picture.
     """
 
@@ -59,9 +60,9 @@ class StudioState(Section):
     object: str
     friction: NonNegative | None = None
     pose: dict[str, float] = {}
-    form: str = str(Form.RAW)
-    colour: str = str(PinColour.DISPLACEMENT)
-    drawn: str = str(OverlayChoices.GRAPH)
+    form: Annotated[Form, Field(strict=False)] = Form.RAW
+    colour: Annotated[PinColour, Field(strict=False)] = PinColour.DISPLACEMENT
+    drawn: Annotated[OverlayChoices, Field(strict=False)] = OverlayChoices.GRAPH
 
     def object_pose(self) -> ObjectPose:
         """The object's pose."""
@@ -79,13 +80,11 @@ class StudioState(Section):
         if len(content) > MOST_BYTES:
             raise TwinError(f"{name}: {len(content)} bytes are not a state of the studio; {remedy}")
         try:
-            state = cls.model_validate(json.loads(content))
-            Form(state.form), PinColour(state.colour), OverlayChoices(state.drawn)
+            state = cls.model_validate_json(content)
         except ValidationError as error:
             first = error.errors()[0]
-            raise TwinError(f"{name}: {'.'.join(map(str, first['loc']))}: {first['msg']}; {remedy}") from error
-        except (ValueError, RecursionError) as error:
-            raise TwinError(f"{name}: not a state of the studio ({error}); {remedy}") from error
+            place = ".".join(map(str, first["loc"])) or "not a state of the studio"
+            raise TwinError(f"{name}: {place}: {problem_text(first)}; {remedy}") from error
         if state.studio != 1 or not set(state.pose) <= set(NAMES):
             raise TwinError(f"{name}: a state of another version; {remedy}")
         return state

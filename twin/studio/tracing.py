@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from multiprocessing import Pipe, connection
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -88,7 +88,7 @@ Outcome = Shading | Traced | Saved | Failed
 
 
 class Tracer:
-    """Path-traces contacts of one sensor. Of several waiting contacts only the newest is traced. A context manager.
+    """Path-traces contacts of one sensor. Of several waiting contacts only the newest is traced. Call ``close`` at the end.
 
     The first outcome is the preview's shading. Each contact has two outcomes: the first pass, and the mean of all passes.
 
@@ -142,10 +142,7 @@ class Tracer:
 
     def outcomes(self) -> list[Outcome]:
         """Outcomes that have arrived since the last call; never waits."""
-        found: list[Outcome] = []
-        while self._found:
-            found.append(self._found.popleft())
-        return found
+        return [self._found.popleft() for _ in range(len(self._found))]
 
     def _receive(self) -> None:
         """Receive outcomes as they arrive. A process that waits to send does not read the next job, so both sides would wait forever."""
@@ -163,14 +160,11 @@ class Tracer:
         except (EOFError, OSError, TypeError):  # this end of the connection, or the other, was closed
             if not self._ended:
                 self._ended = True
-                self._found.append(
-                    Failed("the path tracer's process has ended; pictures stay rasterised. Start the studio again", tracing=True)
-                )
+                why = "the path tracer's process has ended; pictures stay rasterised. Start the studio again"
+                self._found.append(Failed(why, tracing=True))
 
-    def __enter__(self) -> "Tracer":
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """End the process."""
         self._ended = True
         with suppress(OSError):
             self._here.send(None)  # closing the socket alone does not wake the thread that reads from it
@@ -196,64 +190,51 @@ def serve(number: int) -> None:
     """Run the process: receive the sensor and then jobs through a file descriptor, and send outcomes, until that is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C in the terminal ends the studio, which then ends this process
     there = getattr(connection, "PipeConnection", Connection)(number)  # Windows has a class of its own for pipes
+    jobs: deque[_Trace | _Save | None] = deque()
+
+    def overtaken(wait_s: float) -> bool:
+        while there.poll(0 if jobs else wait_s):
+            jobs.append(there.recv())
+        return any(job is None or isinstance(job, _Trace) for job in jobs)
+
     try:
         spec: SensorSpec = there.recv()
+        renderer, simulator = cache(partial(dome_renderer, spec)), cache(partial(Simulator, spec))  # built when they are first needed
         for shading in _catch_render_errors(lambda: iter([dome_shading(spec)]), tracing=True):
             there.send(shading)
-        jobs: deque[_Trace | _Save | None] = deque()
-
-        def overtaken(wait_s: float) -> bool:
-            while there.poll(0 if jobs else wait_s):
-                jobs.append(there.recv())
-            return any(job is None or isinstance(job, _Trace) for job in jobs)
-
-        maker = _Maker(spec, overtaken)
         while (job := jobs.popleft() if jobs else there.recv()) is not None:
-            for outcome in _catch_render_errors(partial(maker, job), tracing=isinstance(job, _Trace)):
+            do = partial(_trace, job, renderer, overtaken) if isinstance(job, _Trace) else partial(_save, job, simulator)
+            for outcome in _catch_render_errors(do, tracing=isinstance(job, _Trace)):
                 there.send(outcome)
     except (EOFError, OSError):
         return
 
 
-class _Maker:
-    """Does the jobs. Renderer and simulator are built when they are first needed. A picture that is ``overtaken`` is not refined."""
+def _trace(job: _Trace, renderer: Callable[[], Renderer], overtaken: Callable[[float], bool]) -> Iterator[Outcome]:
+    """Trace a contact pass by pass, until a newer one has ``overtaken`` it."""
+    samples = [max(1, renderer().spp // part) for part in PARTS]
+    started = time.perf_counter()
+    for k, light in enumerate(renderer().refine(job.state, job.solved, samples=samples)):
+        if k == 0 or k == len(samples) - 1:
+            yield Traced(job.solved, light, 1e3 * (time.perf_counter() - started), rough=k == 0)
+        if overtaken(SHOWN_S if k == 0 else 0.0):
+            return
 
-    def __init__(self, spec: SensorSpec, overtaken: Callable[[float], bool]) -> None:
-        self._spec, self._overtaken = spec, overtaken
-        self._renderer: Renderer | None = None
-        self._simulator: Simulator | None = None
 
-    def __call__(self, job: _Trace | _Save) -> Iterator[Outcome]:
-        return self._trace(job) if isinstance(job, _Trace) else self._save(job)
+def _save(job: _Save, simulator: Callable[[], Simulator]) -> Iterator[Outcome]:
+    from twin.one_contact import write_contact  # imports matplotlib, which no picture of the page needs
 
-    def _trace(self, job: _Trace) -> Iterator[Traced]:
-        if self._renderer is None:
-            self._renderer = dome_renderer(self._spec)
-        started = time.perf_counter()
-        samples = [max(1, self._renderer.spp // part) for part in PARTS]
-        for k, light in enumerate(self._renderer.refine(job.state, job.solved, samples=samples)):
-            if k == 0 or k == len(samples) - 1:
-                yield Traced(job.solved, light, 1e3 * (time.perf_counter() - started), rough=k == 0)
-            if self._overtaken(SHOWN_S if k == 0 else 0.0):
-                return
-
-    def _save(self, job: _Save) -> Iterator[Saved]:
-        from twin.one_contact import write_contact  # imports matplotlib, which no picture of the page needs
-
-        if self._simulator is None:
-            self._simulator = Simulator(self._spec)
-        with SkinPainter() as painter:
-            painter.draw_contact(self._simulator.solver.mesh, self._spec.pins, job.state, build_field(job.obj))
-            rendered = self._simulator.render(job.state, form=job.form)
-            yield Saved(write_contact(job.out, self._simulator, job.obj, job.pose, job.state, rendered, painter)[0])
+    made = simulator()
+    with SkinPainter() as painter:
+        painter.draw_contact(made.solver.mesh, made.spec.pins, job.state, build_field(job.obj))
+        rendered = made.render(job.state, form=job.form)
+        yield Saved(write_contact(job.out, made, job.obj, job.pose, job.state, rendered, painter)[0])
 
 
 def _catch_render_errors(make: Callable[[], Iterator[Outcome]], *, tracing: bool = False) -> Iterator[Outcome]:
     try:
         yield from make()
-    except RenderError as error:
-        yield Failed(str(error), tracing)
     except TwinError as error:
-        yield Failed(str(error))
+        yield Failed(str(error), tracing and isinstance(error, RenderError))
     except (RuntimeError, OSError, ValueError) as error:  # raised by Mitsuba and LLVM, and if the disk is full
         yield Failed(f"{type(error).__name__}: {error}", tracing)

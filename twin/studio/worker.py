@@ -68,7 +68,7 @@ class _OwnThread(ABC):
 
 
 class Worker(_OwnThread):
-    """Moves a contact in its own thread. A context manager.
+    """Moves a contact in its own thread.
 
     Parameters
     ----------
@@ -82,11 +82,7 @@ class Worker(_OwnThread):
     """
 
     def __init__(
-        self,
-        contact: MovingContact,
-        tracer: Tracer | None,
-        on_answer: Callable[[ContactAnswer], None],
-        on_message: Callable[[str], None] = lambda text: None,
+        self, contact: MovingContact, tracer: Tracer | None, on_answer: Callable[[ContactAnswer], None], on_message: Callable[[str], None]
     ) -> None:
         self._contact, self._tracer = contact, tracer
         self._on_answer, self._on_message = on_answer, on_message
@@ -131,13 +127,6 @@ class Worker(_OwnThread):
         answer = self._contact.again()
         if answer is not None:
             self._publish(answer)
-
-    def __enter__(self) -> "Worker":
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
 
     def _run(self) -> None:
         while True:
@@ -203,11 +192,10 @@ class Worker(_OwnThread):
     def _take(self, outcome: Outcome) -> None:
         match outcome:
             case Traced():
-                answer = None
-                if not (outcome.rough and self.newest is not None and self.newest.lit is Light.TRACED):  # no good picture gives way
-                    lit = Light.ROUGH if outcome.rough else Light.TRACED
-                    answer = self._contact.newest_traced(outcome.solved, outcome.light, lit, outcome.ms)
-                if answer is not None:
+                if outcome.rough and self.newest is not None and self.newest.lit is Light.TRACED:
+                    return  # no good picture gives way
+                lit = Light.ROUGH if outcome.rough else Light.TRACED
+                if (answer := self._contact.newest_traced(outcome.solved, outcome.light, lit, outcome.ms)) is not None:
                     self._publish(answer)
             case Shading():
                 self._contact.camera.preview.shading = outcome

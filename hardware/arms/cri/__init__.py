@@ -13,19 +13,3 @@ the same names here.
 from hardware.arms.cri.controller import Controller, DummyController, MagicianController, MG400Controller, RobotController
 from hardware.arms.cri.robot import AsyncBusy, AsyncNotBusy, AsyncRobot, InvalidJointAngles, SyncRobot
 from hardware.arms.cri.transforms import EULER_AXES, InvalidEulerAxes, InvalidEulerPose
-
-__all__ = [
-    "EULER_AXES",
-    "AsyncBusy",
-    "AsyncNotBusy",
-    "AsyncRobot",
-    "Controller",
-    "DummyController",
-    "InvalidEulerAxes",
-    "InvalidEulerPose",
-    "InvalidJointAngles",
-    "MG400Controller",
-    "MagicianController",
-    "RobotController",
-    "SyncRobot",
-]

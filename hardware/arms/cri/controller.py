@@ -11,14 +11,14 @@ from typing import Self
 
 import numpy as np
 
-from hardware.arms.arm import Arm, stop_after
+from hardware.arms.arm import Arm
 from hardware.arms.cri.transforms import Numbers, euler2mat, mat2euler, mat2quat, quat2mat
 from hardware.arms.mg400 import MG400
 from hardware.arms.mg400_wire import DEFAULT_HOSTS, MAX_JOINT_DEG_S, MAX_LINEAR_MM_S
-from hardware.arms.motion import circle, turn_between_deg
+from hardware.arms.motion import circle, way_between
 from hardware.arms.newest import NewestTarget
 from hardware.arms.open_arm import open_arm
-from hardware.errors import DeviceError, leave
+from hardware.errors import DeviceError, leave, undo
 
 # Speeds at the start, as in cri: % of the MG400's largest speed, mm/s and deg/s for other arms.
 START_SPEED = 20.0
@@ -49,6 +49,19 @@ class Closing(ABC):
         """Release the arm."""
 
 
+def _speed(name: str, unit: str) -> property:
+    """A speed of a ``RobotController``, which tells the arm when it is set."""
+
+    def get(controller: "RobotController") -> float:
+        return float(getattr(controller, f"_{name}"))
+
+    def put(controller: "RobotController", speed: float) -> None:
+        setattr(controller, f"_{name}", controller._speed_of(name, speed))
+        controller._set_speeds()
+
+    return property(get, put, doc=f"{unit}; on the MG400 % of its fastest.")
+
+
 class RobotController(Closing):
     """An arm with the interface of ``cri``. The constructor connects and enables it.
 
@@ -69,10 +82,11 @@ class RobotController(Closing):
     """
 
     elbow = commanded_elbow = None
+    linear_speed, angular_speed = _speed("linear_speed", "mm/s"), _speed("angular_speed", "deg/s")
 
     def __init__(self, arm: str | Arm) -> None:
         self.arm = open_arm(arm) if isinstance(arm, str) else arm
-        self._linear = self._angular = START_SPEED
+        self._linear_speed = self._angular_speed = START_SPEED
         self._overall: float | None = None
         self._tilt_deg = np.zeros(2)  # last commanded tilt. It is part of returned poses, because an arm of four axes does not report it
         self._tcp = np.array(NO_POSE)
@@ -102,26 +116,6 @@ class RobotController(Closing):
     @tcp.setter
     def tcp(self, tcp: Numbers) -> None:
         self._tcp = np.asarray(tcp, float)
-
-    @property
-    def linear_speed(self) -> float:
-        """mm/s; on the MG400 % of its fastest."""
-        return self._linear
-
-    @linear_speed.setter
-    def linear_speed(self, speed: float) -> None:
-        self._linear = self._speed_of("linear_speed", speed)
-        self._set_speeds()
-
-    @property
-    def angular_speed(self) -> float:
-        """deg/s; on the MG400 % of its fastest."""
-        return self._angular
-
-    @angular_speed.setter
-    def angular_speed(self, speed: float) -> None:
-        self._angular = self._speed_of("angular_speed", speed)
-        self._set_speeds()
 
     @property
     def speed(self) -> float:
@@ -203,9 +197,8 @@ class RobotController(Closing):
         here, time_s = self.arm.state().pose, 0.0
         linear_mm_s, angular_deg_s = self._speeds()
         for pose in poses:
-            turn_deg = turn_between_deg(here, pose) if self.arm.axes == 6 else abs(pose[5] - here[5])
-            time_s += float(np.linalg.norm(pose[:3] - here[:3])) / linear_mm_s + turn_deg / angular_deg_s
-            here = pose
+            way_mm, turn_deg = way_between(here, pose, self.arm.axes)
+            time_s, here = time_s + way_mm / linear_mm_s + turn_deg / angular_deg_s, pose
         timeout_s = PATIENCE_S + PATIENCE * time_s
         for pose in poses[:-1]:
             self.arm.move_linear(pose, wait=False, timeout_s=timeout_s)
@@ -225,7 +218,7 @@ class RobotController(Closing):
             time.sleep(delay_s)
         except BaseException as error:
             self._end_servo()
-            stop_after(self.arm, error)
+            undo(self.arm.stop, error)
             raise
 
     def _end_servo(self) -> None:
@@ -243,14 +236,15 @@ class RobotController(Closing):
     def _speeds(self) -> tuple[float, float]:
         """Speed of a line in mm/s and of turns in deg/s."""
         overall = self.speed / 100.0
+        linear, angular = overall * self._linear_speed, overall * self._angular_speed
         if isinstance(self.arm, MG400):
-            return overall * self._linear / 100.0 * MAX_LINEAR_MM_S, overall * min(self._linear, self._angular) / 100.0 * MAX_JOINT_DEG_S
-        return overall * self._linear, overall * self._angular
+            return linear / 100.0 * MAX_LINEAR_MM_S, min(linear, angular) / 100.0 * MAX_JOINT_DEG_S
+        return linear, angular
 
     def _set_speeds(self) -> None:
         self._end_servo()
         if isinstance(self.arm, MG400):
-            self.arm.set_speed_percent(linear=self._linear, angular=self._angular, overall=self._overall)
+            self.arm.set_speed_percent(linear=self._linear_speed, angular=self._angular_speed, overall=self._overall)
         else:
             self.arm.set_speed(*self._speeds())
 

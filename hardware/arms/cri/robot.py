@@ -9,18 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from hardware.arms.cri import transforms
 from hardware.arms.cri.controller import NO_POSE, Closing, RobotController
-from hardware.arms.cri.transforms import (
-    EULER_AXES,
-    InvalidEulerAxes,
-    Numbers,
-    euler2mat,
-    euler2quat,
-    mat2euler,
-    mat2quat,
-    quat2euler,
-    quat2mat,
-)
+from hardware.arms.cri.transforms import EULER_AXES, Numbers
 from hardware.errors import DeviceError
 
 # Numbers of joints that arms have.
@@ -82,36 +73,35 @@ class SyncRobot(Closing):
 
     @axes.setter
     def axes(self, axes: str) -> None:
-        if axes not in EULER_AXES:
-            raise InvalidEulerAxes(f"no Euler axes '{axes}'; there are: {', '.join(EULER_AXES)}")
+        transforms.require_axes(axes)
         self._axes = axes
 
     @property
     def tcp(self) -> np.ndarray:
-        return mat2euler(self._T_tip_flange, self._axes)
+        return transforms.mat2euler(self._T_tip_flange, self._axes)
 
     @tcp.setter
     def tcp(self, tcp: Numbers) -> None:
-        self._T_tip_flange = euler2mat(tcp, self._axes)
+        self._T_tip_flange = transforms.euler2mat(tcp, self._axes)
         self.controller.tcp = np.array(NO_POSE)
 
     @property
     def tcp_controller(self) -> np.ndarray:
         """The controller's own tool (6,), whose pose the controller reports and commands."""
-        return quat2euler(self.controller.tcp, self._axes)
+        return transforms.quat2euler(self.controller.tcp, self._axes)
 
     @tcp_controller.setter
     def tcp_controller(self, tcp: Numbers) -> None:
-        self.controller.tcp = euler2quat(tcp, self._axes)
+        self.controller.tcp = transforms.euler2quat(tcp, self._axes)
 
     @property
     def coord_frame(self) -> np.ndarray:
         """The work frame in the base frame (6,)."""
-        return mat2euler(self._T_base_work, self._axes)
+        return transforms.mat2euler(self._T_base_work, self._axes)
 
     @coord_frame.setter
     def coord_frame(self, frame: Numbers) -> None:
-        self._T_base_work = euler2mat(frame, self._axes)
+        self._T_base_work = transforms.euler2mat(frame, self._axes)
 
     linear_speed, angular_speed = _OfController(), _OfController()
     speed, blend_radius = _OfController(), _OfController()
@@ -149,11 +139,12 @@ class SyncRobot(Closing):
 
     def _to_controller(self, pose: Numbers) -> np.ndarray:
         """The controller's pose (7,) for one (6,) in the work frame."""
-        return mat2quat(self._T_base_work @ euler2mat(pose, self._axes) @ self._T_tip_flange)
+        return transforms.mat2quat(self._T_base_work @ transforms.euler2mat(pose, self._axes) @ self._T_tip_flange)
 
     def _from_controller(self, pose: np.ndarray) -> np.ndarray:
         """The reverse of ``_to_controller``."""
-        return mat2euler(np.linalg.inv(self._T_base_work) @ quat2mat(pose) @ np.linalg.inv(self._T_tip_flange), self._axes)
+        T = np.linalg.inv(self._T_base_work) @ transforms.quat2mat(pose) @ np.linalg.inv(self._T_tip_flange)
+        return transforms.mat2euler(T, self._axes)
 
 
 class AsyncRobot(SyncRobot):

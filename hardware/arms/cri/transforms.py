@@ -86,7 +86,12 @@ def inv_transform_euler(pose: Numbers, frame: Numbers, axes: str = "sxyz") -> np
     return mat2euler(euler2mat(frame, axes) @ euler2mat(pose, axes), axes)
 
 
-def _scipy_axes(axes: str) -> str:
+def require_axes(axes: str) -> None:
+    """Raise ``InvalidEulerAxes`` if there are no such Euler axes."""
     if axes not in EULER_AXES:
         raise InvalidEulerAxes(f"no Euler axes '{axes}'; there are: {', '.join(EULER_AXES)}")
+
+
+def _scipy_axes(axes: str) -> str:
+    require_axes(axes)
     return axes[1:] if axes[0] == "s" else axes[1:].upper()

@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, BaseArm
-from hardware.arms.kinematics import OutOfReachError, finite_numbers, joint_target
-from hardware.arms.motion import turn_between_deg
+from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, KinematicArm
+from hardware.arms.motion import way_between
 from hardware.arms.ur.client import CONNECT_S, WATCHDOG_HZ, ClientProcess
 from hardware.arms.ur.kinematics import MODELS, UrKinematics, pose_from_ur, pose_to_ur
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
@@ -45,7 +44,7 @@ HALF_TURN_DEG = 181.0  # the most that a joint turns in a linear move, and a mar
 SPEEDS, MOST_SPEED, LINEAR_M_S2, JOINT_RAD_S2 = (50.0, 30.0), 3.0, 1.2, 1.4
 
 
-class UR(BaseArm):
+class UR(KinematicArm):
     """A Universal Robots arm with PolyScope 3 or 5.
 
     Its pose is that of the arm's active TCP in the base frame. ``enable`` uploads the control program of ``ur_rtde``, which ends any other
@@ -59,6 +58,7 @@ class UR(BaseArm):
     """
 
     axes = 6
+    kinematics: UrKinematics
 
     def __init__(self, host: str) -> None:
         self.name, self._host = f"UR at {host}", host
@@ -158,40 +158,33 @@ class UR(BaseArm):
         self._require_speeds(linear_mm_s, angular_deg_s)
         self._speeds = linear_mm_s, angular_deg_s
 
-    def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        with self._watch_move():
-            sent, state = finite_numbers(f"{self.name}: the pose", pose, 6), self.state()
-            with ErrorsAs(OutOfReachError, lambda error: DeviceError(f"{self.name}: {error}; nothing was sent")):
-                joints = self.kinematics.inverse(sent)
-            if np.abs(joints - state.joints_deg).max() > HALF_TURN_DEG:  # ``inverse`` has turned it back by a full turn
-                raise DeviceError(f"{self.name}: a joint would pass its end, so nothing was sent; turn it back with move_joints")
-            # the arm takes the speed as m/s or as rad/s: whichever takes longer, line or turn
-            way_mm, turn_deg = float(np.linalg.norm(sent[:3] - state.pose[:3])), turn_between_deg(state.pose, sent)
-            lasts_s = max(way_mm / self._speeds[0], turn_deg / self._speeds[1], POLL_S)
-            self._move("moveL", joints, pose_to_ur(sent), max(way_mm / 1000, np.radians(turn_deg)) / lasts_s, LINEAR_M_S2)
-            if wait:
-                self._wait_until_settled(sent, timeout_s=timeout_s)
-        return sent
+    def _joints_at(self, pose: np.ndarray) -> np.ndarray:
+        self.state()  # which tells the kinematics the present joints
+        return super()._joints_at(pose)
 
-    def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
-        with self._watch_move():
-            sent = joint_target(self.name, joints_deg, self.axes)
-            self._move("moveJ", sent, np.radians(sent).tolist(), float(np.radians(self._speeds[1])), JOINT_RAD_S2)
-            if wait:  # the maker's lengths are not exactly this arm's
-                self._wait_until_settled(self.kinematics.forward(sent), tolerance_mm=5.0, tolerance_deg=1.0, timeout_s=timeout_s)
-        return sent
-
-    def _move(self, method: str, joints_deg: np.ndarray, target: list[float], speed: float, acceleration: float) -> None:
+    def _move(self, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float) -> None:
         state = self.state()
         if state.error or not state.enabled:
             raise DeviceError(f"{self.name}: {state.error or 'not enabled; call enable() first'}")
-        if violation := self.kinematics.violation(joints_deg):
-            raise DeviceError(f"{self.name}: {violation.text}; nothing was sent")
+        self._require_within(joints)
+        if pose is None:
+            method, target, speed, acceleration = "moveJ", np.radians(joints).tolist(), np.radians(self._speeds[1]), JOINT_RAD_S2
+        else:
+            if np.abs(joints - state.joints_deg).max() > HALF_TURN_DEG:  # ``inverse`` has turned it back by a full turn
+                raise DeviceError(f"{self.name}: a joint would pass its end, so nothing was sent; turn it back with move_joints")
+            # the arm takes the speed as m/s or as rad/s: whichever takes longer, line or turn
+            way_mm, turn_deg = way_between(state.pose, pose, self.axes)
+            lasts_s = max(way_mm / self._speeds[0], turn_deg / self._speeds[1], POLL_S)
+            method, target, speed, acceleration = "moveL", pose_to_ur(pose), max(way_mm / 1000, np.radians(turn_deg)) / lasts_s, LINEAR_M_S2
         if (slider := self._newest()["TargetSpeedFraction"]) != self._slider:
             LOG.warning("%s: its speed slider is at %.0f %%, which slows all moves", self.name, 100 * slider)
         self._under_way, self._slider = True, slider
         if not self._ask(method, target, float(min(speed, MOST_SPEED)), acceleration, True):
             raise DeviceError(f"{self.name}: {self.state().error or 'refused the move; look at its teach pendant'}")
+        if wait and pose is not None:
+            self._wait_until_settled(pose, timeout_s=timeout_s)
+        elif wait:  # the maker's lengths are not exactly this arm's
+            self._wait_until_settled(self.kinematics.forward(joints), tolerance_mm=5.0, tolerance_deg=1.0, timeout_s=timeout_s)
 
     def _halt(self, act: Callable[[], object], obeyed: Callable[[dict[str, Any]], bool]) -> None:
         """Stop, and see that the arm obeys. If it does not, its control program is ended, whether or not that can be seen."""

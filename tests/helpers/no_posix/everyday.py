@@ -4,6 +4,7 @@ import importlib
 import pkgutil
 import sys
 import threading
+from contextlib import closing
 from pathlib import Path
 
 
@@ -80,7 +81,7 @@ def terminals():
 
 
 def commands():
-    from hardware.emulators.running import run_until_signal
+    from hardware.emulators.faults import Emulator
     from hardware.live.doctor import examine_machine
     from twin.signals import signals_as_ctrl_c
 
@@ -90,7 +91,9 @@ def commands():
     from signal import SIGINT, raise_signal
 
     threading.Timer(0.5, raise_signal, (SIGINT,)).start()
-    run_until_signal(nullcontext(), lambda: "now")
+    device = nullcontext()
+    device.place, device.error = "now", None
+    Emulator.run(device)
 
 
 def studio():
@@ -98,7 +101,7 @@ def studio():
     from twin.studio.tracing import Failed, Tracer
 
     found = threading.Event()
-    with Tracer(twin.load_sensor("mg400-127")) as tracer:
+    with closing(Tracer(twin.load_sensor("mg400-127"))) as tracer:
         tracer.on_outcome = found.set
         tracer.start()
         assert found.wait(100)

@@ -86,11 +86,6 @@ class Cnn(nn.Module):
         pixels = (images[:, None].float() / 255).contiguous(memory_format=torch.channels_last)
         return {"mean": self.dense(self.convolutions(pixels).flatten(1))}
 
-    def penalty(self) -> torch.Tensor:
-        """The regularisation of the hidden dense weights."""
-        weights = [layer.weight for layer in list(self.dense)[:-1] if isinstance(layer, nn.Linear)]
-        return torch.stack([L1 * w.abs().sum() + L2 * w.square().sum() for w in weights]).sum()
-
 
 @dataclass(frozen=True, kw_only=True)
 class CnnModel(Model):
@@ -121,8 +116,9 @@ class CnnModel(Model):
         return Cnn(self.filters, self.dense, outputs)
 
     def penalty(self, network: nn.Module) -> torch.Tensor:
-        """See ``Model``."""
-        return cast(Cnn, network).penalty()
+        """See ``Model``: the regularisation of the hidden dense weights."""
+        weights = [layer.weight for layer in list(cast(Cnn, network).dense)[:-1] if isinstance(layer, nn.Linear)]
+        return torch.stack([L1 * w.abs().sum() + L2 * w.square().sum() for w in weights]).sum()
 
     def estimate_frame(self, trained: Trained, frame: Frame) -> Prediction:
         """See ``Model``."""

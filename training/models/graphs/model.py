@@ -14,15 +14,14 @@ from typing import Any, Literal, cast
 
 import numpy as np
 import torch
+from scipy.sparse import csr_array
 from torch import nn
 
 from training.data.pins import PinTable
 from training.models.part import Learnt, PinModel, Recipe, refuse_sizes
 from twin.frames.forms import frame_size
-from twin.pins.flips import directed_edges
-from twin.pins.graph import knn_edges
+from twin.pins import make_graph
 from twin.pins.labelling.reference import Reference
-from twin.pins.voronoi import triangulate
 
 CHANNELS = (16, 32, 48, 64, 96)
 DENSE = {"paper": (96, 64), "release": (128, 96)}
@@ -32,61 +31,37 @@ SLOPE = 0.01
 RELEASE_PX = 300.0
 
 
-@dataclass(frozen=True)
-class GraphRows:
-    """Normalised adjacency, or its transpose, of M graphs of N nodes as sparse rows.
-
-    Attributes
-    ----------
-    start : (M, N + 1) int32
-        Index of each node's first entry, counted from the graph's first entry.
-    first : (M + 1,) int64
-        Index of each graph's first entry in ``column`` and ``weight``.
-    column : (nnz,) int16
-    weight : (nnz,) float32
-    """
-
-    start: np.ndarray
-    first: np.ndarray
-    column: np.ndarray
-    weight: np.ndarray
-
-    def batch(self, rows: np.ndarray) -> torch.Tensor:
-        """The block diagonal matrix (B N, B N) of some of the graphs, as sparse rows."""
-        n = self.start.shape[1] - 1
-        counts = self.first[rows + 1] - self.first[rows]
-        offset = np.concatenate([[0], np.cumsum(counts)])
-        take = np.arange(offset[-1]) + np.repeat(self.first[rows] - offset[:-1], counts)
-        column = self.column[take].astype(np.int32) + np.repeat(np.arange(len(rows), dtype=np.int32) * n, counts)
-        start = (self.start[rows, :-1] + offset[:-1, None]).ravel()
-        crow = torch.from_numpy(np.append(start, offset[-1]).astype(np.int32))
-        size = (len(rows) * n,) * 2
-        column, weight = torch.from_numpy(column), torch.from_numpy(self.weight[take])
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Sparse CSR")  # "in beta state", said once
-            return torch.sparse_csr_tensor(crow, column, weight, size, check_invariants=False)
-
-
-def graph_rows(edges: list[np.ndarray], nodes: int, *, transposed: bool = False) -> GraphRows:
-    """Normalise the directed edges (E_k, 2), source and target, of graphs of ``nodes`` nodes each. A loop is added to every node.
+def graph_rows(edges: list[np.ndarray], nodes: int, *, transposed: bool = False) -> csr_array:
+    """Normalised adjacency (M N, N) of M graphs of ``nodes`` nodes, one below the other, or its transposes.
 
     A row holds the in-edges of a node (``transposed``: its out-edges) with the weights ``1 / sqrt(d_i d_j)``, d being the in-degree
-    including the loop.
+    including the loop that is added to every node.
+
+    Parameters
+    ----------
+    edges : list of (E_k, 2) int arrays
+        Directed edges of each graph, source and target.
     """
-    starts, columns, weights = [], [], []
-    loop = np.arange(nodes)
-    for pairs in edges:
-        source, target = np.concatenate([pairs[:, 0], loop]), np.concatenate([pairs[:, 1], loop])
-        degree = np.bincount(target, minlength=nodes)
-        row, column = (source, target) if transposed else (target, source)
-        order = np.lexsort((column, row))
-        starts.append(np.concatenate([[0], np.cumsum(np.bincount(row, minlength=nodes))]))
-        columns.append(column[order])
-        weights.append(1 / np.sqrt(degree[source[order]] * degree[target[order]]))
-    first = np.concatenate([[0], np.cumsum([len(c) for c in columns])])
-    return GraphRows(
-        np.array(starts, np.int32), first, np.concatenate(columns).astype(np.int16), np.concatenate(weights).astype(np.float32)
-    )
+    every = np.concatenate([nodes * k + pairs for k, pairs in enumerate(edges)])
+    loop = np.arange(nodes * len(edges))
+    source, target = (np.concatenate([ends, loop]) for ends in every.T)
+    degree = np.bincount(target)
+    weight = (1 / np.sqrt(degree[source] * degree[target])).astype(np.float32)
+    row, column = (source, target) if transposed else (target, source)
+    return csr_array((weight, (row, column % nodes)), shape=(len(loop), nodes))
+
+
+def block_diagonal(rows: csr_array, chosen: np.ndarray) -> torch.Tensor:
+    """The block diagonal matrix (B N, B N) of some of the graphs (B,) of ``graph_rows``, as sparse rows."""
+    nodes = rows.shape[1]
+    start = nodes * np.arange(len(chosen))
+    found = rows[(nodes * chosen[:, None] + np.arange(nodes)).ravel()]
+    column = found.indices + np.repeat(start, np.diff(found.indptr[np.append(start, len(start) * nodes)]))
+    indptr, column, weight = (torch.from_numpy(values) for values in (found.indptr.astype(np.int32), column.astype(np.int32), found.data))
+    size = (len(start) * nodes,) * 2
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Sparse CSR")  # "in beta state", said once
+        return torch.sparse_csr_tensor(indptr, column, weight, size, check_invariants=False)
 
 
 class GraphConvolution(torch.autograd.Function):
@@ -174,7 +149,6 @@ class Gcn(nn.Module):
 
     def __init__(self, features: int, outputs: int, variant: str = "paper") -> None:
         super().__init__()
-        self.features, self.outputs, self.variant = features, outputs, variant
         widths = (features, *CHANNELS)
         self.convolutions = nn.ModuleList([nn.Linear(a, b, bias=False) for a, b in zip(widths[:-1], widths[1:], strict=True)])
         self.norms = nn.ModuleList([nn.BatchNorm1d(c) for c in CHANNELS])
@@ -204,24 +178,19 @@ class Gcn(nn.Module):
         """
         graphs, nodes = x.shape[:2]
         h = x.reshape(graphs * nodes, -1)
-        for layer, norm in zip(self.convolutions, self.norms, strict=True):
-            h = self._convolve(h, matrix, transpose, cast(nn.Linear, layer).weight, cast(nn.BatchNorm1d, norm))
+        for layer, norm in zip(cast(list[nn.Linear], self.convolutions), cast(list[nn.BatchNorm1d], self.norms), strict=True):
+            running_mean, running_var = cast(torch.Tensor, norm.running_mean), cast(torch.Tensor, norm.running_var)
+            if not self.training:
+                size = norm.weight * (running_var + norm.eps).rsqrt()
+                out = torch.addmm(norm.bias - size * running_mean, matrix @ h, (size[:, None] * layer.weight).T)
+                h = nn.functional.leaky_relu_(out, SLOPE)
+                continue
+            h, mean, variance = GraphConvolution.apply(matrix, transpose, h, layer.weight, norm.weight, norm.bias, norm.eps)
+            with torch.no_grad():
+                momentum = cast(float, norm.momentum)
+                running_mean.lerp_(mean, momentum)
+                running_var.lerp_(variance * (len(h) / max(len(h) - 1, 1)), momentum)
         return {"mean": self.dense(h.view(graphs, nodes, -1).mean(dim=1))}
-
-    def _convolve(
-        self, h: torch.Tensor, matrix: torch.Tensor, transpose: torch.Tensor, weight: torch.Tensor, norm: nn.BatchNorm1d
-    ) -> torch.Tensor:
-        running_mean, running_var = cast(torch.Tensor, norm.running_mean), cast(torch.Tensor, norm.running_var)
-        if not self.training:
-            size = norm.weight * (running_var + norm.eps).rsqrt()
-            out = torch.addmm(norm.bias - size * running_mean, matrix @ h, (size[:, None] * weight).T)
-            return nn.functional.leaky_relu_(out, SLOPE)
-        out, mean, variance = GraphConvolution.apply(matrix, transpose, h, weight, norm.weight, norm.bias, norm.eps)
-        with torch.no_grad():
-            momentum = cast(float, norm.momentum)
-            running_mean.lerp_(mean, momentum)
-            running_var.lerp_(variance * (len(h) / max(len(h) - 1, 1)), momentum)
-        return out
 
 
 class GraphInputs:
@@ -238,9 +207,8 @@ class GraphInputs:
 
     def __init__(self, features: np.ndarray, edges: list[np.ndarray], *, symmetric: bool) -> None:
         self.x = torch.from_numpy(features.astype(np.float32))
-        nodes = features.shape[1]
-        self.forward: GraphRows = graph_rows(edges, nodes)
-        self.back: GraphRows = self.forward if symmetric else graph_rows(edges, nodes, transposed=True)
+        self.forward = graph_rows(edges, features.shape[1])
+        self.back = self.forward if symmetric else graph_rows(edges, features.shape[1], transposed=True)
 
     def __len__(self) -> int:
         return len(self.x)
@@ -248,14 +216,8 @@ class GraphInputs:
     def batch(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Arguments of the network for some rows."""
         chosen = rows.numpy()
-        matrix = self.forward.batch(chosen)
-        return self.x[rows], matrix, matrix if self.back is self.forward else self.back.batch(chosen)
-
-
-def frame_edges(kind: str, nodes_px: np.ndarray) -> np.ndarray:
-    """Directed edges (E, 2) of one frame: ``knn``, or ``delaunay`` (nearest neighbours if the pins form no triangles)."""
-    triangles = None if kind == "knn" else triangulate(nodes_px)
-    return knn_edges(nodes_px) if triangles is None else directed_edges(triangles, len(nodes_px))
+        matrix = block_diagonal(self.forward, chosen)
+        return self.x[rows], matrix, matrix if self.back is self.forward else block_diagonal(self.back, chosen)
 
 
 def pixel_features(nodes_px: np.ndarray, area_px2: np.ndarray | None, width_px: int) -> np.ndarray:
@@ -289,7 +251,7 @@ class GraphModel(PinModel):
         """See ``PinModel``. Nothing is learnt before training, and the camera's place is not corrected."""
         width_px = frame_size(pins.sensor, pins.form)[0]
         features = pixel_features(pins.nodes_px, pins.area_px2 if self._sees_areas else None, width_px)
-        edges = [frame_edges(self.edges, nodes_px) for nodes_px in pins.nodes_px]
+        edges = [make_graph(self.edges, nodes_px).edges for nodes_px in pins.nodes_px]
         return GraphInputs(features, edges, symmetric=self._sees_areas)
 
     @property

@@ -1,15 +1,24 @@
 """``steered``: our model of an edge's direction, a label that goes round the whole circle.
 
 Its network makes a first guess of the direction from the whole field, and takes a second look at the field turned by this guess. Both looks
-are multi-layer perceptrons on the principal components of the field's coefficients (``field``). In training, the first look gets every
+are multi-layer perceptrons on the principal components of the field's coefficients. In training, the first look gets every
 frame turned by a random angle, and its answer is turned back. Therefore it need not learn the same contact again for each direction. The
 second look gets the field turned back by the first guess and an error of some degrees. It estimates the rest of the direction and the other
 labels. In this view all contacts are similar, so that few principal components show small differences. Both looks also get the angle of the
 turn as an input, because no sensor is exactly the same all around.
+
+The field is the displacement of the pins in a form that can be turned exactly, for any layout. With the complex displacement
+u = u_x + i u_y at the place r (cos p, sin p) about the layout's middle, it is a sum of waves,
+
+    u = sum_mn  c_mn R_mn(r) exp(i m p)
+
+with the radial polynomials R_mn of Zernike (1934). A contact that is turned by an angle t in the picture has the displacement
+exp(i t) u(r, p - t), and therefore the coefficients c_mn exp(i t (1 - m)).
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from math import factorial
 from typing import cast
 
 import numpy as np
@@ -20,9 +29,12 @@ from training.data.label_code import LabelCode
 from training.data.pins import PinTable
 from training.errors import TrainingError
 from training.models.part import ArrayInputs, Inputs, Learnt, Modes, PinModel, Recipe, refuse_sizes
-from training.models.steered.field import Waves, waves_of
 from twin.pins.labelling.reference import Reference
 
+# Number of pins for each coefficient: with fewer pins the fit follows the noise of single pins.
+PINS_A_WAVE = 2.5
+# Highest degree of the waves: finer ones are below the noise of a pin in every recording.
+MOST_DEGREE = 14
 # Number of turns of a frame over which the first look's answers are averaged in use.
 TURNS = 6
 # Number of second looks in use. The first one uses the first look's direction, each further one that of the one before.
@@ -35,6 +47,46 @@ COPIES = 3
 KNOWN_OF_TURN = 4
 # Components of the turned field that are inputs of a Gaussian process. Finer ones are noise to it.
 PROCESS_MODES = 20
+
+
+@dataclass(frozen=True)
+class Waves:
+    """The waves of a layout with N pins.
+
+    Attributes
+    ----------
+    fit : (C, N) complex
+        From the complex displacements of the pins to the C coefficients, by least squares.
+    order : (C,) int
+        1 - m of each coefficient: how many times a coefficient turns when the contact turns once.
+    """
+
+    fit: np.ndarray
+    order: np.ndarray
+
+
+def waves_of(rest_px: np.ndarray) -> Waves:
+    """The waves of a layout at rest (N, 2). Waves of the same m are orthogonal over the pins."""
+    place = (rest_px - rest_px.mean(axis=0)) @ [1, 1j]
+    place = place / np.abs(place).max()
+    degree = 0
+    while degree < MOST_DEGREE and PINS_A_WAVE * (degree + 2) * (degree + 3) / 2 <= len(rest_px):
+        degree += 1
+    parts, order = [], []
+    for m in range(-degree, degree + 1):
+        radial = np.stack([_radial(n, abs(m), np.abs(place)) for n in range(abs(m), degree + 1, 2)], axis=1)
+        smooth, _ = np.linalg.qr(radial * np.exp(1j * m * np.angle(place))[:, None])
+        parts.append(smooth)
+        order += [1 - m] * smooth.shape[1]
+    return Waves(np.linalg.pinv(np.concatenate(parts, axis=1)), np.array(order))
+
+
+def _radial(n: int, m: int, r: np.ndarray) -> np.ndarray:
+    total = np.zeros_like(r)
+    for k in range((n - m) // 2 + 1):
+        size = factorial(n - k) / (factorial(k) * factorial((n + m) // 2 - k) * factorial((n - m) // 2 - k))
+        total += (-1) ** k * size * r ** (n - 2 * k)
+    return total
 
 
 @dataclass(frozen=True)
@@ -108,9 +160,8 @@ class Steered(nn.Module):
     sine: torch.Tensor  # () int64: place of the direction's sine among the numbers; its cosine follows
     sense: torch.Tensor  # () 1 if the label grows when the contact turns from x to y in the picture, else -1
 
-    def __init__(self, waves: Waves, outputs: int, size: SteeredSize | None = None) -> None:
+    def __init__(self, waves: Waves, outputs: int, size: SteeredSize) -> None:
         super().__init__()
-        self.size = size = size or SteeredSize()
         self.outputs = outputs
         self.register_buffer("fit", torch.from_numpy(np.stack([waves.fit.real, waves.fit.imag]).astype(np.float32)))
         self.register_buffer("order", torch.from_numpy(waves.order.astype(np.float32)))

@@ -120,10 +120,9 @@ class Vgnn(nn.Module):
     area_mean: torch.Tensor  # (N,)
     waves: torch.Tensor  # (N, frequencies)
 
-    def __init__(self, edges: np.ndarray, pins: int, outputs: int, size: VgnnSize | None = None) -> None:
+    def __init__(self, edges: np.ndarray, pins: int, outputs: int, size: VgnnSize) -> None:
         super().__init__()
-        self.size = size = size or VgnnSize()
-        self.pins, self.outputs = pins, outputs
+        self.size, self.outputs = size, outputs
         self._weights: torch.Tensor | None = None
         adjacency = torch.zeros(pins, pins)
         adjacency[edges[:, 1], edges[:, 0]] = 1.0

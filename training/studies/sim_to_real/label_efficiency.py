@@ -13,9 +13,9 @@ import numpy as np
 
 from training.data.dataset import load_dataset
 from training.data.label_code import goes_round
+from training.studies.sim_to_real import steps
 from training.studies.sim_to_real.model_inversion import read_row, read_twin
-from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL, WITHOUT, SimToRealPlan
-from training.studies.sim_to_real.steps import arm_labels, choose_frames, designed_frames, full_twin, quadratic_row
+from training.studies.sim_to_real.steps import BOTH, EVENLY, REAL, WITHOUT, SimToRealPlan
 from twin.progress import Progress, silent, stage
 
 UNLABELLED = (300, 3000)
@@ -40,20 +40,20 @@ def label_efficiency(plan: SimToRealPlan, out: Path, seeds: Sequence[int], *, pr
     """
     with stage(progress, "frames") as step:
         real = load_dataset(plan.frames, plan.sensor, plan.experiment.targets, progress=step).in_order()
-    labels = arm_labels(real)
-    sets = full_twin(plan, plan.sensor, labels, None).simulated_sets(plan, out, plan.sensor, real.pins.form, plan.simulated, progress)
+    labels = steps.arm_labels(real)
+    sets = steps.full_twin(plan, plan.sensor, labels, None).simulated_sets(plan, out, plan.sensor, real.pins.form, plan.simulated, progress)
     twin = read_twin(sets, plan.target_object, plan.experiment, seed=plan.seed)
     unlabelled = UNLABELLED if any(goes_round(real.targets.units, real.targets.corrected)) else ()
     found: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for seed in seeds:
-        chosen = choose_frames(len(real), plan.labels, seed)
+        chosen = steps.choose_frames(len(real), plan.labels, seed)
         every = [np.zeros(0, int), *chosen.nested, chosen.trained["all"]]
         made = []
-        for designed, among in (("", every), (EVENLY, designed_frames(real, chosen, seed))):
+        for designed, among in (("", every), (EVENLY, steps.designed_frames(real, chosen, seed))):
             for rows in among:
                 made.append(read_row(f"{BOTH}{designed}", twin, real, labels, rows, chosen.test))
                 if len(rows):
-                    made.append(quadratic_row(f"{REAL}{designed}", real, rows, chosen.test))
+                    made.append(steps.quadratic_row(f"{REAL}{designed}", real, rows, chosen.test))
         pool = np.random.default_rng(seed).permutation(np.setdiff1d(chosen.trained["all"], chosen.few))
         for count in unlabelled:
             if count <= len(pool):

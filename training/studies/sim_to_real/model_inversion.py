@@ -4,7 +4,7 @@ A frame's waves t are turned to the object's frame of the labels l. They differ 
 
     r(l) = t - d(l) - e(l)
 
-(``TwinField``, ``missed``). With S the covariance of what is left of such a frame, the labels have the negative logarithmic probability
+(``TwinField``, ``Missed``). With S the covariance of what is left of such a frame, the labels have the negative logarithmic probability
 
     J(l) / 2 = r' S^-1 r / 2 + |l - m|^2 / 2 w^2
 
@@ -31,9 +31,9 @@ from training.data.dataset import Dataset
 from training.data.label_code import wrapped_deg
 from training.data.targets import unit_of
 from training.runs.gaussian_process import Kernel, Points, Posterior, Term, fit_processes
-from training.studies.sim_to_real.field import TwinField, parts
-from training.studies.sim_to_real.missed import MOST_FRAMES, Left, Missed, choose_evenly
+from training.studies.sim_to_real.field import MOST_FRAMES, MOVES_FROM, Left, Missed, TwinField, parts
 from training.studies.sim_to_real.steps import MODES, arm_labels, label_errors, stands_and_moves, states_touching, states_within
+from twin.frames import spread_indices
 from twin.rig.labels import ArmLabel
 
 READ = "model inversion"
@@ -61,8 +61,6 @@ EQUAL_FRAMES = 10.0
 OUTLIER = 1.5
 """Errors are limited to this multiple of the quantile ``OUTLIER_QUANTILE`` of their sizes before they are squared."""
 OUTLIER_QUANTILE = 0.9
-POSES = 6
-"""Columns of a label before those of the move."""
 WIDTH = 1.5
 """Width w of the prior on the labels, in half ranges."""
 STARTS = 700
@@ -152,7 +150,7 @@ class ModelInversion:
         """
         if not len(wanted_px):
             return np.zeros((0, 12))
-        rows = choose_evenly(len(real_px), MOST_FRAMES)
+        rows = spread_indices(len(real_px), MOST_FRAMES)
         field, known, seen = self._field, stands_and_moves(labels)[rows], self._field.waves(real_px)[rows]
         noise = field.noise(real_px if len(real_px) else wanted_px)
 
@@ -165,11 +163,11 @@ class ModelInversion:
         found = reader(seen[:0], known[:0])
         if unlabelled_px is not None and field.direction is not None:
             more = field.waves(unlabelled_px)
-            told = _in_groups(found, more)
-            sure = np.flatnonzero(told.sure)
-            sure = sure[choose_evenly(len(sure), MOST_FRAMES)]
-            found = reader(more[sure], told.labels[sure])
-        return _in_groups(found, field.waves(wanted_px)).labels
+            told, certain = _in_groups(found, more)
+            sure = np.flatnonzero(certain)
+            sure = sure[spread_indices(len(sure), MOST_FRAMES)]
+            found = reader(more[sure], told[sure])
+        return _in_groups(found, field.waves(wanted_px))[0]
 
 
 def _fixed_columns(ranges: np.ndarray) -> np.ndarray:
@@ -177,29 +175,11 @@ def _fixed_columns(ranges: np.ndarray) -> np.ndarray:
     return np.flatnonzero(np.ptp(ranges, axis=1) == 0)
 
 
-def _in_all_directions(states: np.ndarray, direction: int | None) -> list[np.ndarray]:
-    """States (S, 12), once for each direction that is tried, or once if there is none."""
-    if direction is None:
-        return [states]
-    turned = np.repeat(states[None], round(360 / TURN_DEG), axis=0)
-    turned[:, :, direction] = np.arange(-180.0, 180.0, TURN_DEG)[:, None]
-    return list(turned)
-
-
-def _in_groups(reader: "_Reader", waves: np.ndarray) -> "_Found":
-    """Estimates of ``AT_ONCE`` frames at a time."""
-    found = [reader(waves[first : first + AT_ONCE]) for first in range(0, len(waves), AT_ONCE)]
-    return _Found(
-        np.concatenate([np.zeros((0, 12)), *(each.labels for each in found)]),
-        np.concatenate([np.zeros(0, bool), *(each.sure for each in found)]),
-    )
-
-
-class _Found(NamedTuple):
-    """Estimated labels (B, 12), and whether each frame's direction is sure (B,), which it is where there is none."""
-
-    labels: np.ndarray
-    sure: np.ndarray
+def _in_groups(reader: "_Reader", waves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The results of a reader, of ``AT_ONCE`` frames at a time."""
+    found = [(np.zeros((0, 12)), np.zeros(0, bool)), *(reader(waves[first : first + AT_ONCE]) for first in range(0, len(waves), AT_ONCE))]
+    labels, sure = zip(*found, strict=True)
+    return np.concatenate(labels), np.concatenate(sure)
 
 
 class _Reader:
@@ -208,26 +188,30 @@ class _Reader:
     def __init__(self, field: TwinField, missed: Missed, left: Left, ranges: np.ndarray) -> None:
         self._field, self._missed, self._left = field, missed, left
         fixed = _fixed_columns(ranges)
-        states = field.known[choose_evenly(len(field.known), STARTS)].copy()
+        states = field.known[spread_indices(len(field.known), STARTS)].copy()
         states[:, fixed] = ranges[fixed, 0]
         self._unknown = np.setdiff1d(field.varied, fixed).tolist()
         self._turn = None if field.direction in fixed else field.direction
-        self._starts = [(states, self._mean_components(states)) for states in _in_all_directions(states, self._turn)]
+        self._starts = []
+        for direction in [0.0] if self._turn is None else np.arange(-180.0, 180.0, TURN_DEG):
+            turned = states.copy()
+            turned[:, [] if self._turn is None else self._turn] = direction
+            self._starts.append((turned, self._mean_components(turned)))
 
-    def __call__(self, waves: np.ndarray) -> _Found:
-        """Pose and move of frames with waves (B, C)."""
+    def __call__(self, waves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pose and move (B, 12) of frames with waves (B, C), and whether each frame's direction is sure (B,); it is where there is none."""
         frames = _Frames(waves, self._left.weights(waves))
         turn = self._turn
         nearest, least = zip(*(self._nearest(frames, *each) for each in self._starts), strict=True)
         starts, far = np.stack(nearest, axis=1), np.stack(least, axis=1)
         best = starts[np.arange(len(waves)), far.argmin(axis=1)]
         if turn is None:
-            return _Found(self._improve_labels(frames, best, self._unknown, STEPS).labels, np.ones(len(waves), bool))
-        best = self._improve_labels(frames, best, [*self._unknown, turn], STEPS).labels
+            return self._improve_labels(frames, best, self._unknown, STEPS)[0], np.ones(len(waves), bool)
+        best, *_ = self._improve_labels(frames, best, [*self._unknown, turn], STEPS)
         return self._mean(frames, best, starts, far - far.min(axis=1, keepdims=True))
 
-    def _mean(self, frames: _Frames, best: np.ndarray, starts: np.ndarray, excess: np.ndarray) -> _Found:
-        """The mean labels over all directions.
+    def _mean(self, frames: _Frames, best: np.ndarray, starts: np.ndarray, excess: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The mean labels over all directions, and whether they are sure.
 
         Parameters
         ----------
@@ -242,23 +226,23 @@ class _Reader:
         tried = [starts[frame, which], best[frame]]
         tried[1][:, turn] = tried[0][:, turn]
         first, second = (self._objective(several, each) for each in tried)
-        found = self._improve_labels(several, np.where((first < second)[:, None], *tried), self._unknown, 1)
+        labels, objective, _ = self._improve_labels(several, np.where((first < second)[:, None], *tried), self._unknown, 1)
         lowest = np.full(len(best), np.inf)
-        np.minimum.at(lowest, frame, found.objective)
-        likely = found.objective < lowest[frame] + UNLIKELY / 2
+        np.minimum.at(lowest, frame, objective)
+        likely = objective < lowest[frame] + UNLIKELY / 2
         frame, which, several = frame[likely], which[likely], several.rows(likely)
-        found = self._improve_labels(several, found.labels[likely], self._unknown, AROUND_STEPS)
+        labels, objective, volume = self._improve_labels(several, labels[likely], self._unknown, AROUND_STEPS)
         told = np.full(excess.shape, -np.inf)
-        told[frame, which] = -(found.objective + found.volume) / 2 / TEMPERATURE
+        told[frame, which] = -(objective + volume) / 2 / TEMPERATURE
         weight = np.exp(told - told.max(axis=1, keepdims=True))[frame, which]
         total = np.bincount(frame, weight)
-        mean = np.stack([np.bincount(frame, weight * column) for column in found.labels.T], axis=1) / total[:, None]
-        around = np.exp(1j * np.radians(found.labels[:, turn]))
+        mean = np.stack([np.bincount(frame, weight * column) for column in labels.T], axis=1) / total[:, None]
+        around = np.exp(1j * np.radians(labels[:, turn]))
         middle = (np.bincount(frame, weight * around.real) + 1j * np.bincount(frame, weight * around.imag)) / total
         mean[:, turn] = np.degrees(np.angle(middle))
         near = np.abs(wrapped_deg(mean[:, turn] - best[:, turn])) < NEAR_DEG
         mean[near, turn] = best[near, turn]
-        return _Found(mean, np.abs(middle) > SURE)
+        return mean, np.abs(middle) > SURE
 
     def _nearest(self, frames: _Frames, states: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The state (B, 12) of one direction whose expected waves ``there`` (S, 2C) are nearest to each frame's, and its misfit (B,)."""
@@ -268,8 +252,11 @@ class _Reader:
         near = far.argmin(axis=1)
         return states[near], far[np.arange(len(near)), near]
 
-    def _improve_labels(self, frames: _Frames, labels: np.ndarray, columns: list[int], steps: int) -> "_Improved":
-        """Labels (B, 12) after damped Gauss-Newton steps in some columns."""
+    def _improve_labels(
+        self, frames: _Frames, labels: np.ndarray, columns: list[int], steps: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Labels (B, 12) after damped Gauss-Newton steps in some columns, J (B,) there, and the logarithm (B,) of the determinant of the
+        normal matrix."""
         labels, field = labels.copy(), self._field
         half, prior = self._scales(columns)
         damping = np.full(len(labels), DAMPING)
@@ -291,7 +278,7 @@ class _Reader:
             better = lower < objective
             labels[better], residual[better], objective[better] = moved[better], there[better], lower[better]
             damping *= np.where(better, DAMPING_LESS, DAMPING_MORE)
-        return _Improved(labels, objective, np.linalg.slogdet(normal)[1])
+        return labels, objective, np.linalg.slogdet(normal)[1]
 
     def _scales(self, columns: list[int]) -> tuple[np.ndarray, np.ndarray]:
         """Half range (K,) of some labels and the precision (K,) of their prior in half ranges; a direction has none."""
@@ -332,23 +319,6 @@ class _Reader:
     def _object_components(self, frames: _Frames, labels: np.ndarray) -> np.ndarray:
         """(B, 2C) components of the frames' waves in the object's frame."""
         return parts(frames.waves * self._field.turn_factors(labels, back=True)) @ self._left.axes
-
-
-class _Improved(NamedTuple):
-    """Result of Gauss-Newton steps.
-
-    Attributes
-    ----------
-    labels : (B, 12) float
-    objective : (B,) float
-        J.
-    volume : (B,) float
-        Logarithm of the determinant of the normal matrix.
-    """
-
-    labels: np.ndarray
-    objective: np.ndarray
-    volume: np.ndarray
 
 
 class TwinForwards:
@@ -403,7 +373,7 @@ class TwinRead:
 
     def __init__(self, moved_px: np.ndarray, labels: Sequence[ArmLabel], rest_px: np.ndarray, ranges: np.ndarray, *, seed: int = 0) -> None:
         self._backwards = ModelInversion(moved_px, labels, rest_px, ranges, seed=seed)
-        self._columns = [k for k in self._backwards.unknown if k < POSES]
+        self._columns = [k for k in self._backwards.unknown if k < MOVES_FROM]
         told = stands_and_moves(labels)[:, self._columns]
         self._forwards = None if self._backwards.turns else TwinForwards(moved_px, told, seed=seed)
 
@@ -416,11 +386,9 @@ class TwinRead:
         """
         if self._forwards is None:
             return self._backwards.estimate(real_px, labels, wanted_px, unlabelled_px)
-        rows = choose_evenly(len(labels), MOST_FRAMES)
+        rows = spread_indices(len(labels), MOST_FRAMES)
         known_px, known = real_px[rows], [labels[row] for row in rows]
-        back, forth = self._both(known_px, known, wanted_px)
-        back[:, self._columns] = self._average_readings(self._shares(*self._fold_readings(known_px, known), known), back, forth)
-        return back
+        return self._blend(*self._both(known_px, known, wanted_px), self._shares(*self._fold_readings(known_px, known), known))
 
     def left_out(self, real_px: np.ndarray, labels: Sequence[ArmLabel]) -> tuple[np.ndarray, np.ndarray]:
         """The labelled frames (m,) that are chosen to be evaluated, and pose and move (m, 12) of each, estimated from frames of other
@@ -430,12 +398,14 @@ class TwinRead:
         """
         rows, back, forth = self._fold_readings(real_px, labels)
         if self._forwards is not None:
-            back[:, self._columns] = self._average_readings(self._shares(rows, back, forth, labels), back, forth)
+            self._blend(back, forth, self._shares(rows, back, forth, labels))
         return rows, back
 
-    def _average_readings(self, share: np.ndarray, back: np.ndarray, forth: np.ndarray) -> np.ndarray:
-        """Poses (B, K) by the weights (K,) of those from model inversion, as pose and move (B, 12), and of those read forwards (B, K)."""
-        return np.asarray(share * back[:, self._columns] + (1 - share) * forth)
+    def _blend(self, back: np.ndarray, forth: np.ndarray, share: np.ndarray) -> np.ndarray:
+        """Average poses from model inversion, in pose and move (B, 12), with those read forwards (B, K). ``share`` (K,): weight of the
+        former."""
+        back[:, self._columns] = share * back[:, self._columns] + (1 - share) * forth
+        return back
 
     def _both(self, real_px: np.ndarray, labels: Sequence[ArmLabel], wanted_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pose and move (B, 12) from model inversion, and poses (B, K) read forwards, NaN where a label is a direction."""
@@ -446,7 +416,7 @@ class TwinRead:
 
     def _fold_readings(self, real_px: np.ndarray, labels: Sequence[ArmLabel]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rows (m,) of labelled frames, and both readings of each, as ``_both``, from frames of other folds."""
-        fold, rows = np.arange(len(labels)) % FOLDS, choose_evenly(len(labels), WEIGHED) if len(labels) > 1 else np.zeros(0, int)
+        fold, rows = np.arange(len(labels)) % FOLDS, np.array(spread_indices(len(labels), WEIGHED) if len(labels) > 1 else [], int)
         back, forth = np.zeros((len(rows), 12)), np.zeros((len(rows), len(self._columns)))
         for each in np.unique(fold[rows]):
             asked, others = fold[rows] == each, np.flatnonzero(fold != each)

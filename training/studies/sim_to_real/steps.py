@@ -1,4 +1,4 @@
-"""The steps of the sim-to-real study. Each can be called alone.
+"""The plan of the sim-to-real study, the names in its tables, and its steps. Each step can be called alone.
 
 ``Twin`` is one twin of the study: the one with all ingredients, or one without one ingredient.
 """
@@ -11,41 +11,47 @@ from typing import Any
 
 import numpy as np
 
-from scenes import load_randomisation
-from scenes.experiment import ExperimentSpec, MoveRanges
-from scenes.object import ObjectSpec
-from scenes.randomisation import FrictionSpread, RandomisationSpec
-from scenes.rig import RigSpec
-from scenes.sensor import SensorSpec
+from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, RigSpec, SensorSpec, load_experiment, load_object, load_randomisation
+from scenes.experiment import MoveRanges
+from scenes.randomisation import FrictionSpread
 from training.data.dataset import Dataset, join_datasets, load_dataset, split_rows
 from training.data.design import nearest_to_even
 from training.data.label_code import LabelCode, goes_round, label_error
 from training.data.pins import voronoi_areas
-from training.data.simulated import config_of, is_pins_only, open_simulated
+from training.data.simulated import config_of, is_pins_only, is_simulated, open_simulated
 from training.data.targets import Targets
 from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
-from training.generation import GenerationConfig, generate
+from training.generation import GenerationConfig, generate, require_count
 from training.models import model_named, recipe_of
 from training.models.steered.model import STEERED
 from training.models.vgnn.model import VGNN
 from training.runs.assemble import intervals
-from training.runs.config import RunConfig
+from training.runs.config import RunConfig, frame_marks, identity_of
 from training.runs.gaussian_process import fit_two_fidelities
-from training.runs.identity import frame_marks, identity_of
 from training.runs.run import is_finished, train_run
 from training.runs.run_files import CONFIG, TENSORS, read_tensors, write_tensors
 from training.studies.judging import leak_check, measure_errors
 from training.studies.sim_to_real.discrepancy import FRICTIONS, Discrepancy
-from training.studies.sim_to_real.plan import FULL, SimToRealPlan
+from twin.errors import DatasetError
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.frames import open_recording
 from twin.progress import Progress, Step, stage, unheard
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel, poses_and_moves, read_arm_labels
 from twin.store import output, overwriting, write_text, writes
-from twin.types import Form
+from twin.types import FINE, Form
 
+FULL = "sim_only"
+"""Name and folder of the twin with all ingredients."""
+MOST_DRAWS = 1000
+"""Most draws of what the twin misses, for each contact. More would not fit into memory."""
+REAL, BOTH = "real", "simulated and real"
+"""Names of rows of models that were trained on real frames alone, and from simulated contacts and real frames."""
+EVENLY = ", even"
+"""What is added to these where the frames are not sampled at random, but nearest to an even sequence."""
+WITHOUT = ", {count} without labels"
+"""What is added to these where the model also learnt from ``count`` frames without labels."""
 # Elements across the skin of the twin with a coarse mesh.
 COARSE = 12
 # Share of the contacts that the twin with few contacts is trained on.
@@ -66,6 +72,84 @@ RANGE_MARGIN = 0.1
 MODES = 20
 # Penalties of the quadratic regression that are tried; the one with the smallest leave-one-out error is used.
 RIDGES = 10.0 ** np.arange(-4, 3.1, 0.5)
+
+
+@dataclass(frozen=True)
+class SimToRealPlan:
+    """Settings of a study.
+
+    Attributes
+    ----------
+    sensor : SensorSpec
+    frames : Path
+        A labelled real recording.
+    experiment : ExperimentSpec
+        The experiment that the recording was made with. It also names the labels that are trained on.
+    contacts : ExperimentSpec or None
+        The experiment that is simulated; None: ``experiment`` with its wider ranges.
+    labels : int
+        Number of labelled frames that are used with the simulated contacts.
+    seed : int
+        Seed of the choice of frames, the contacts and the weights.
+    draws : int
+        Number of discrepancies that are sampled for each contact.
+    count : int
+        Number of contacts to simulate.
+    simulated : tuple of Path
+        Finished data sets to use instead of simulating contacts for the twin with all ingredients; several are joined.
+    calibrate : bool
+        Fit the specification to the labelled frames first.
+    ablate : bool
+        Also train without one ingredient at a time.
+    epochs : int or None
+        Epochs of every training; None: the default of that training.
+    workers : int
+        Processes that simulate.
+    across : int
+        Elements along each side of the skin's grid.
+
+    Raises
+    ------
+    DatasetError
+        ``draws`` or ``count`` is out of range.
+    TrainingError
+        A folder of ``simulated`` holds no simulated data set.
+    """
+
+    sensor: SensorSpec
+    frames: Path
+    experiment: ExperimentSpec
+    contacts: ExperimentSpec | None = None
+    labels: int = 40
+    seed: int = 0
+    draws: int = 2
+    count: int = 500
+    simulated: tuple[Path, ...] = ()
+    calibrate: bool = False
+    ablate: bool = False
+    epochs: int | None = None
+    workers: int = 1
+    across: int = FINE
+
+    def __post_init__(self) -> None:
+        require_count(self.count)
+        if not 1 <= self.draws <= MOST_DRAWS:
+            raise DatasetError(f"`draws` {self.draws}: expected 1 to {MOST_DRAWS} for each contact")
+        for folder in self.simulated:
+            if not is_simulated(folder):
+                raise TrainingError(f"`sim` {folder}: no simulated data set; give the folder of one that 'twin dataset' has finished")
+
+    @property
+    def target_object(self) -> ObjectSpec:
+        """The object of the recording's experiment."""
+        return load_object(self.experiment.object)
+
+    @property
+    def wider(self) -> ExperimentSpec:
+        """The experiment that is simulated."""
+        if self.contacts is not None:
+            return self.contacts
+        return load_experiment(self.experiment, wide=bool(self.experiment.wide or self.experiment.wider))
 
 
 @dataclass(frozen=True)
@@ -106,17 +190,8 @@ class Twin:
 
     def config(self, obj: ObjectSpec, seed: int) -> GenerationConfig:
         """Configuration of the twin's contacts, without pictures."""
-        return GenerationConfig(
-            sensor=self.sensor,
-            object=obj,
-            experiment=self.experiment,
-            randomisation=self.randomisation,
-            friction=rig_of(self.sensor).friction,
-            seed=seed,
-            images="none",
-            states="all",
-            across=self.across,
-        )
+        parts: dict[str, Any] = {"sensor": self.sensor, "object": obj, "experiment": self.experiment, "randomisation": self.randomisation}
+        return GenerationConfig(**parts, friction=rig_of(self.sensor).friction, seed=seed, images="none", states="all", across=self.across)
 
     def simulated_sets(
         self, plan: SimToRealPlan, out: Path, sensor: SensorSpec, form: Form, given: Sequence[Path], progress: Progress
@@ -296,9 +371,7 @@ def train_in_twin(
     """
     model = model_for(sim)
     recipe = recipe_of(model, members=1, epochs=epochs or TWIN_EPOCHS, kernel=False)
-    taught: dict[str, object] = {}
-    if labelled is not None:
-        taught = identity_of(labelled, model_named(model)) | {"image_names": labelled.pins.image_name.tolist()}
+    taught = {} if labelled is None else identity_of(labelled, model_named(model)) | {"image_names": labelled.pins.image_name.tolist()}
     _train(RunConfig(model, recipe, seed=seed, split=split, labelled=taught), sim, out, progress)
 
 

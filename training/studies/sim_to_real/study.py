@@ -1,33 +1,38 @@
-"""The sim-to-real study, from its plan to its tables and runs.
+"""The sim-to-real study, from its plan to its tables, runs and page: errors by the number of labelled real frames.
 
 One of its networks is trained on real frames without labels: model inversion estimates their labels (pseudo-labels). The twin is read in
 seconds for hundreds of frames, but not by a live loop. The network has nearly its errors, and is a run as any other. It needs no label of
 these frames, only more of them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
 from scenes import load_randomisation
 from training.data.dataset import Dataset, join_datasets, load_dataset
-from training.data.targets import Targets
+from training.data.targets import Targets, unit_of
 from training.estimate.estimator import PoseEstimator
 from training.runs.assemble import intervals
 from training.studies.sim_to_real import steps
 from training.studies.sim_to_real.discrepancy import Discrepancy, Residuals, measure_residuals
-from training.studies.sim_to_real.model_inversion import TwinRead, named_labels, read_row, read_twin
-from training.studies.sim_to_real.page import write_page
-from training.studies.sim_to_real.plan import BOTH, EVENLY, REAL, WITHOUT, SimToRealPlan
+from training.studies.sim_to_real.model_inversion import READ, TwinRead, named_labels, read_row, read_twin
+from training.studies.sim_to_real.steps import BOTH, EVENLY, REAL, WITHOUT, SimToRealPlan
 from twin.calibration.contact import fit_contact
 from twin.calibration.contact.simulate import CalibrationSetup
 from twin.estimate import readable_labels
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.progress import Progress, Step, silent, stage, unheard
-from twin.report.table import write_table
+from twin.report.charts import muted_colour, plain_log, sized_figure, write_chart
+from twin.report.page import Page, PagePicture
+from twin.report.table import Column, number, write_table
+from twin.report.themes import BLUE, OLIVE, PURPLE, RED
 from twin.rig.labels import ArmLabel
 from twin.store import writes
 from twin.types import ReadableResult
@@ -35,6 +40,12 @@ from twin.types import ReadableResult
 SEEDS_APART = 1000  # between the draws of one study, so that those of seeds 0, 1, 2... differ
 BESIDE, TAUGHT = "sim_plus_real", "sim_taught"  # folders of the run with labelled frames beside it, and of the one that the twin taught
 SHOWN_MODES = 4  # of what the twin misses, that the page names
+# Name of the row of the model trained in the twin alone. Names of rows without one ingredient begin with this word and a comma.
+SIMULATED = "simulated"
+# Name of the row of the model trained on simulated pins without a sampled discrepancy.
+BARE = "simulated, bare"
+# Colours and lines of the models trained on real frames, in the order of the rows.
+STYLES = ((RED, "o-"), (OLIVE, "s--"))
 
 
 def teach(
@@ -116,13 +127,11 @@ class SimToRealResult(ReadableResult):
     def lines(self) -> list[str]:
         """The result as lines of text, one for each model."""
         names = [key.removesuffix("_raw") for key in self.rows[0] if key.endswith("_raw")]
-        labels = dict(zip(names, readable_labels(names), strict=True))
-        shown = [(f"{name}_{kind}", f"{label} {kind}") for name, label in labels.items() for kind in ("corrected", "raw")]
-        return [
-            f"{row['trained_on']}, {row['labelled_frames']} labelled, {row['model']}: "
-            + ", ".join(f"{label} {row[key]:.3g}" for key, label in shown)
-            for row in self.rows
-        ]
+        labels, lines = dict(zip(names, readable_labels(names), strict=True)), []
+        for row in self.rows:
+            errors = [f"{label} {kind} {row[f'{name}_{kind}']:.3g}" for name, label in labels.items() for kind in ("corrected", "raw")]
+            lines.append(f"{row['trained_on']}, {row['labelled_frames']} labelled, {row['model']}: {', '.join(errors)}")
+        return lines
 
 
 @dataclass(frozen=True)
@@ -168,34 +177,27 @@ def run(plan: SimToRealPlan, out: Path, *, progress: Progress = silent) -> SimTo
     TrainingError
         There are too few frames, or the labels of the simulated contacts differ from theirs.
     """
-    ground = _prepare(plan, out, progress)
-    known = {_residual_key(ground.full): Discrepancy(ground.residuals)}
+    ground, seed = _prepare(plan, out, progress), plan.seed
+    real, few, test = ground.real, ground.few, ground.chosen.test
     sets: dict[str, list[Dataset]] = {}
     rows: list[dict[str, Any]] = []
     for twin in ground.twins:
-        missing = _missing(ground, twin, known)
+        folder, given = out / twin.name, plan.simulated if twin is ground.full else ()
+        missing = _missing(ground, twin) if twin.learns else None
         if twin.contacts not in sets:
-            given = plan.simulated if twin is ground.full else ()
-            sets[twin.contacts] = twin.simulated_sets(plan, out, ground.setup.sensor, ground.real.pins.form, given, progress)
-        learnt, folder = _training_sets(ground, twin, sets[twin.contacts], missing), out / twin.name
-        labelled, copies = None if missing is None else ground.few, [each.pins for each in learnt[1:]]
+            sets[twin.contacts] = twin.simulated_sets(plan, out, ground.setup.sensor, real.pins.form, given, progress)
+        learnt = _training_sets(ground, twin, sets[twin.contacts], missing)
+        every, labelled = learnt[0].with_copies([each.pins for each in learnt[1:]]), few if twin.learns else None
         with stage(progress, twin.name) as step:
-            every, seed = learnt[0].with_copies(copies), plan.seed
             steps.train_in_twin(every, folder, seed=seed, split=seed, epochs=plan.epochs, labelled=labelled, progress=step)
-        if twin is ground.full:
-            bare = steps.states_touching(sets[twin.contacts], plan.target_object)
-            like = bare.rows(steps.states_like(bare, ground.few))
-            beside = steps.combine_co_kriging(folder, out / BESIDE, like, ground.few, seed=plan.seed)
+        if missing is not None and twin is ground.full:
+            bare, full_learnt, modes = steps.states_touching(sets[twin.contacts], plan.target_object), learnt[0], missing.summary()
+            beside = steps.combine_co_kriging(folder, out / BESIDE, bare.rows(steps.states_like(bare, few)), few, seed=seed)
             steps.widen_intervals(folder, beside.intervals)
-            full_learnt = learnt[0]
-        rows.append(steps.evaluate_run_row(twin.says, 0, folder, ground.real, ground.chosen.test))
-        if twin is ground.full:
-            rows.append(steps.evaluate_run_row(BOTH, plan.labels, out / BESIDE, ground.real, ground.chosen.test))
-    rows += _without_the_twin(ground)
-    read = read_twin(sets[ground.full.contacts], plan.target_object, plan.experiment, seed=plan.seed)
-    rows += _invert_model_rows(ground, read)
-    rows.append(_train_on_labelled(ground, read))
-    page = write_page(ground, rows, beside, known[_residual_key(ground.full)].summary()[:SHOWN_MODES], full_learnt)
+        rows.append(steps.evaluate_run_row(twin.says, 0, folder, real, test))
+    rows.insert(1, steps.evaluate_run_row(BOTH, plan.labels, out / BESIDE, real, test))
+    rows += _without_the_twin(ground) + _from_the_read_twin(ground, sets[ground.full.contacts])
+    page = write_page(ground, rows, beside, modes[:SHOWN_MODES], full_learnt)
     return SimToRealResult(rows, beside.left_out, ground.residuals.error_px, [write_table(out / "study.csv", rows), page])
 
 
@@ -222,20 +224,11 @@ def _prepare(plan: SimToRealPlan, out: Path, progress: Progress) -> Ground:
     return Ground(plan, out, progress, setup, real, few, chosen, measured, residuals, full, [full, *others])
 
 
-def _residual_key(twin: steps.Twin) -> tuple[int, tuple[float, ...]]:
-    """Everything that the residuals of a twin depend on within one study."""
-    return twin.across, twin.frictions
-
-
-def _missing(ground: Ground, twin: steps.Twin, known: dict[tuple[int, tuple[float, ...]], Discrepancy]) -> Discrepancy | None:
-    """The discrepancy of a twin that uses one, else None. ``known`` stores it for other twins with the same residuals."""
-    if not twin.learns:
-        return None
-    if _residual_key(twin) not in known:
+def _missing(ground: Ground, twin: steps.Twin) -> Discrepancy:
+    """The discrepancy of a twin. Contacts that were simulated for another one are not simulated again."""
+    with stage(ground.progress, f"{twin.name}: labelled frames") as step:
         setup = replace(ground.setup, across=twin.across)
-        with stage(ground.progress, f"{twin.name}: labelled frames") as step:
-            known[_residual_key(twin)] = Discrepancy(measure_residuals(setup, ground.measured, step, frictions=twin.frictions))
-    return known[_residual_key(twin)]
+        return Discrepancy(measure_residuals(setup, ground.measured, step, frictions=twin.frictions))
 
 
 def _training_sets(ground: Ground, twin: steps.Twin, sets: list[Dataset], missing: Discrepancy | None) -> list[Dataset]:
@@ -251,35 +244,182 @@ def _training_sets(ground: Ground, twin: steps.Twin, sets: list[Dataset], missin
     return [twin.part(each) for each in drawn]
 
 
-def _invert_model_rows(ground: Ground, twin: TwinRead) -> list[dict[str, Any]]:
-    """Rows of the table for model inversion, with growing numbers of labelled frames."""
-    labels, test = steps.arm_labels(ground.real), ground.chosen.test
-    rows = [read_row(BOTH, twin, ground.real, labels, rows, test) for rows in (np.zeros(0, int), *ground.chosen.nested)]
-    designed = steps.designed_frames(ground.real, ground.chosen, ground.plan.seed)
-    return rows + [read_row(f"{BOTH}{EVENLY}", twin, ground.real, labels, rows, test) for rows in designed]
+def _from_the_read_twin(ground: Ground, sets: list[Dataset]) -> list[dict[str, Any]]:
+    """Rows of the table for model inversion, with growing numbers of labelled frames, and for the run that it teaches.
 
-
-def _train_on_labelled(ground: Ground, twin: TwinRead) -> dict[str, Any]:
-    """Train a run on the labelled frames and on all others that are not evaluated, with the labels that model inversion estimates for
-    them."""
-    plan, real, few = ground.plan, ground.real, ground.chosen.few
-    others = np.setdiff1d(ground.chosen.trained["all"], few)
+    This run is trained on the labelled frames and on all others that are not evaluated, with the labels that model inversion estimates.
+    """
+    plan, real, chosen, folder = ground.plan, ground.real, ground.chosen, ground.out / TAUGHT
+    twin = read_twin(sets, plan.target_object, plan.experiment, seed=plan.seed)
+    labels, others = steps.arm_labels(real), np.setdiff1d(chosen.trained["all"], chosen.few)
+    asked = [(BOTH, rows) for rows in (np.zeros(0, int), *chosen.nested)]
+    asked += [(f"{BOTH}{EVENLY}", rows) for rows in steps.designed_frames(real, chosen, plan.seed)]
+    read = [read_row(name, twin, real, labels, rows, chosen.test) for name, rows in asked]
     with stage(ground.progress, TAUGHT) as step:
-        teach(twin, real, steps.arm_labels(real), few, others, ground.out / TAUGHT, seed=plan.seed, epochs=plan.epochs, progress=step)
-    return steps.evaluate_run_row(BOTH + WITHOUT.format(count=len(others)), len(few), ground.out / TAUGHT, real, ground.chosen.test)
+        teach(twin, real, labels, chosen.few, others, folder, seed=plan.seed, epochs=plan.epochs, progress=step)
+    return [*read, steps.evaluate_run_row(BOTH + WITHOUT.format(count=len(others)), plan.labels, folder, real, chosen.test)]
 
 
 def _without_the_twin(ground: Ground) -> list[dict[str, Any]]:
     """Rows of the table for the models that are trained on real frames alone."""
-    rows = []
-    for name, index in ground.chosen.trained.items():
+    plan, real, chosen, rows = ground.plan, ground.real, ground.chosen, []
+    for name, index in chosen.trained.items():
         folder = ground.out / f"real_{name}"
         with stage(ground.progress, folder.name) as step:
-            steps.train_on_real(ground.real.rows(index), folder, seed=ground.plan.seed, epochs=ground.plan.epochs, progress=step)
-        rows.append(steps.evaluate_run_row(REAL, len(index), folder, ground.real, ground.chosen.test))
-        rows.append(steps.quadratic_row(REAL, ground.real, index, ground.chosen.test))
-    counts = {len(index) for index in ground.chosen.trained.values()}
-    others = [index for index in ground.chosen.nested if len(index) not in counts]
-    rows += [steps.quadratic_row(REAL, ground.real, index, ground.chosen.test) for index in others]
-    designed = steps.designed_frames(ground.real, ground.chosen, ground.plan.seed)
-    return rows + [steps.quadratic_row(f"{REAL}{EVENLY}", ground.real, index, ground.chosen.test) for index in designed]
+            steps.train_on_real(real.rows(index), folder, seed=plan.seed, epochs=plan.epochs, progress=step)
+        rows.append(steps.evaluate_run_row(REAL, len(index), folder, real, chosen.test))
+        rows.append(steps.quadratic_row(REAL, real, index, chosen.test))
+    counts = {len(index) for index in chosen.trained.values()}
+    others = [(REAL, index) for index in chosen.nested if len(index) not in counts]
+    others += [(f"{REAL}{EVENLY}", index) for index in steps.designed_frames(real, chosen, plan.seed)]
+    return rows + [steps.quadratic_row(name, real, index, chosen.test) for name, index in others]
+
+
+def write_page(
+    ground: Ground, rows: Sequence[Mapping[str, Any]], beside: steps.CoKriging, modes: Sequence[Mapping[str, float]], learnt: Dataset
+) -> Path:
+    """Write ``index.html`` and its charts, and return the page's path.
+
+    Parameters
+    ----------
+    ground : Ground
+        What all models of the study have in common.
+    rows : sequence of mappings
+        The study's table.
+    beside : CoKriging
+        Result of the average with a Gaussian process, whose errors are stated.
+    modes : sequence
+        First modes of the discrepancy: the ``share`` of each, and the part of it that the label explains (``told``).
+    learnt : Dataset
+        The simulated states that the model was trained on, without a discrepancy or with its first draw.
+    """
+    plan, folder, real, names = ground.plan, ground.out, ground.real, ground.real.targets.names
+    page = Page(f"From the twin to real frames: {ground.setup.sensor.name}", "twin study sim-to-real", topic="TacTip twin: study")
+    page.lead = (
+        f"Mean absolute errors on the same {number(len(ground.chosen.test))} real frames, a random fifth of {number(len(real))}, which "
+        f"were used for no training and for no choice. The {number(plan.labels)} labelled frames were sampled at random from the others "
+        f"(seed {plan.seed})."
+    )
+    page.notice("Notes on the recording", real.problems)
+    page.figures(*_charts(folder, rows, names, plan.labels))
+    page.section("Errors")
+    page.table(rows, [_column(key, names) for key in rows[0]], caption="The least error of each column is marked.")
+    page.text(
+        "Corrected labels have the shear moves that were never executed taken out; all models were trained on these. The leak slope is "
+        "that of the angle's error on such moves: a model that reads the contact has 0. Inside 90 %: share of the frames whose label lies "
+        "within the model's 90 % interval."
+    )
+    fitted = "fitted to the labelled frames first" if plan.calibrate else "as shipped, not fitted to the labelled frames"
+    friction = ground.full.randomisation.friction
+    contacts = len(np.unique(steps.contact_of(learnt)))
+    rubbed = "that of the rig" if friction is None else f"sampled between {friction.low:.2f} and {friction.high:.2f}"
+    known = zip(names, readable_labels(names), beside.left_out, strict=True)
+    missed = ", ".join(f"{label} {number(float(error))} {unit_of(name)}" for name, label, error in known)
+    page.section("How it was made")
+    page.items(
+        [
+            f"The twin: {number(len(learnt))} states of {number(contacts)} simulated contacts. Its specification is {fitted}"
+            f"{'' if plan.calibrate else ' (the file states from which frames)'}.",
+            f"The twin's pins are {number(ground.residuals.error_px, decimals=2)} px off those of the labelled frames, with the best "
+            f"friction of each frame; for simulated contacts it is {rubbed}.",
+            "The error of the pins is a Gaussian process of the label, fitted to the labelled frames and sampled for every simulated "
+            f"contact{', except in the rows called bare and uncalibrated' if _of(rows, BARE) else ''}. Its first modes have "
+            f"{_percents(modes, 'share')} of it; the label explains {_percents(modes, 'told')} of these.",
+            "Simulated and real: the model from the twin, averaged with a Gaussian process, in which the label of a real frame is that of "
+            "a simulated contact plus a smooth difference. The errors of that process alone, with one labelled frame left out after "
+            f"another, are {missed}. These errors also widen the 90 % intervals of the model from the twin, but not those of the other "
+            "rows.",
+            "Model inversion: the labels whose simulated pins are most like the frame's. The twin's error is a quadratic function of the "
+            "label, fitted to the labelled frames. Even: these frames are not sampled at random; they are nearest to an even sequence.",
+            "Pins are counted from the no-contact frame of the recording, or of each simulated sensor.",
+        ]
+    )
+    page.download(folder / "study.csv", "the table, with all digits")
+    return page.write(folder / "index.html")
+
+
+def _charts(folder: Path, rows: Sequence[Mapping], names: Sequence[str], labelled: int) -> list[PagePicture]:
+    """Errors by the number of labelled frames, and errors without one ingredient at a time if there are such rows."""
+    chart = write_chart(folder / "errors.png", lambda: errors_figure(rows, names))
+    shown = "Errors of each label against the number of labelled real frames, for training in the twin and on real frames"
+    caption = (
+        "Errors against corrected labels by the number of labelled real frames. The dashed line is training in the twin alone: it is "
+        f"trained on no real label, but the {number(labelled)} labelled frames show the error of its pins."
+    )
+    charts = [PagePicture(chart, shown, caption)]
+    if others := [row for row in rows if row["trained_on"].startswith(f"{SIMULATED},")]:
+        chart = write_chart(folder / "ingredients.png", lambda: ingredients_figure([*_of(rows, SIMULATED), *others], names))
+        shown = "Errors of training in the twin with one ingredient left out or changed at a time"
+        caption = "Training in the twin alone, with one ingredient left out or changed at a time; the line is the full recipe."
+        charts.append(PagePicture(chart, shown, caption))
+    return charts
+
+
+def errors_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
+    """A chart of errors against corrected labels by the number of labelled real frames; a panel for each label, both axes logarithmic."""
+    figure, axes = sized_figure((5.2 * len(names), 4.2), len(names))
+    for ax, name, label in zip(axes, names, readable_labels(names), strict=True):
+        key = f"{name}_corrected"
+        models = dict.fromkeys(row["model"] for row in _of(rows, REAL))
+        for model, (color, line) in zip(models, STYLES[-len(models) :], strict=False):
+            _curve(ax, _model(rows, REAL, model), key, line, color, f"real frames, {model}")
+            _curve(ax, _model(rows, f"{REAL}{EVENLY}", model), key, "s:", color, f"evenly chosen frames, {model}")
+        for row in _of(rows, SIMULATED):
+            ax.axhline(row[key], color=BLUE, ls=(0, (5, 2)), label="twin alone")
+        for row in _of(rows, BOTH):
+            if row["model"] != READ:
+                ax.plot(row["labelled_frames"], row[key], "*", color=PURPLE, ms=13, label="twin and labelled frames")
+            elif not row["labelled_frames"]:
+                ax.axhline(row[key], color=PURPLE, ls=(0, (1, 2)), label="model inversion, no label")
+        _curve(ax, _model(rows, BOTH, READ), key, "^-", PURPLE, "model inversion")
+        _curve(ax, _model(rows, f"{BOTH}{EVENLY}", READ), key, "^:", PURPLE, "model inversion, evenly chosen frames")
+        ax.set(title=f"{label} error", xlabel="labelled real frames", ylabel=f"mean absolute error, {unit_of(name)}")
+        ax.set(xscale="log", yscale="log")
+        counts = sorted({row["labelled_frames"] for row in rows if row["labelled_frames"]})
+        ax.set_xticks(counts, [number(count) for count in counts])
+        ax.xaxis.set_minor_locator(NullLocator())
+        plain_log(ax.yaxis)
+    axes[0].legend()
+    return figure
+
+
+def _model(rows: Sequence[Mapping], trained_on: str, model: str) -> list[Mapping]:
+    """Rows of one model with labelled frames, by their number."""
+    mine = [row for row in _of(rows, trained_on) if row["model"] == model and row["labelled_frames"]]
+    return sorted(mine, key=lambda row: row["labelled_frames"])
+
+
+def _curve(ax: Axes, rows: Sequence[Mapping], key: str, line: str, color: str, label: str) -> None:
+    """The errors of some rows by their numbers of labelled frames."""
+    if rows:
+        ax.plot([row["labelled_frames"] for row in rows], [row[key] for row in rows], line, color=color, label=label)
+
+
+def ingredients_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
+    """A chart of the errors of the rows trained in the twin: the first row as a line, the others as dots; a panel for each label."""
+    figure, axes = sized_figure((4.4 * len(names) + 2.0, 0.34 * len(rows) + 1.1), len(names))
+    places = np.arange(len(rows))[::-1]
+    for panel, (ax, name) in enumerate(zip(axes, names, strict=True)):
+        errors = [row[f"{name}_corrected"] for row in rows]
+        ax.axvline(errors[0], color=muted_colour(), ls="--", lw=1.0)
+        ax.plot(errors, places, "o", color=BLUE)
+        ax.set_yticks(places, [row["trained_on"] for row in rows] if panel == 0 else [])
+        ax.set(xlabel=f"{readable_labels(names)[panel]}: mean absolute error, {unit_of(name)}", xlim=(0, 1.08 * max(errors)))
+    return figure
+
+
+def _of(rows: Sequence[Mapping], trained_on: str) -> list[Mapping]:
+    return [row for row in rows if row["trained_on"] == trained_on]
+
+
+def _column(key: str, names: Sequence[str]) -> Column:
+    for name, label in zip(names, readable_labels(names), strict=True):
+        if key in (f"{name}_corrected", f"{name}_raw"):
+            return Column(key, f"{label}, {key.removeprefix(name)[1:]}", unit_of(name), digits=2, best="least")
+        if key == f"{name}_inside_90":
+            return Column(key, f"{label} inside 90 %", "%", decimals=0, scale=100)
+    return Column(key, "leak slope", digits=2, signed=True) if key == "leak_slope" else Column.of(key)
+
+
+def _percents(modes: Sequence[Mapping[str, float]], key: str) -> str:
+    return ", ".join(f"{100 * mode[key]:.0f} %" for mode in modes)

@@ -3,8 +3,6 @@
 import csv
 import ctypes
 import gc
-import threading
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
@@ -30,15 +28,8 @@ from twin.progress import Progress, silent, stage
 INITIAL_ROWS = 500
 # Bytes of a MiB.
 MIB = 2.0**20
-# File of the Linux kernel with this process's memory.
-STATM = Path("/proc/self/statm")
-# Time between two measurements of the process's memory, s.
-WATCH_S = 0.01
-# Columns of the page's table of models that hold no errors, in the order of the table.
-SHOWN = (
-    *("model", "seed", "state", "epochs", "epochs_allowed", "training_minutes", "s_per_epoch", "parameters"),
-    *("frames", "without_prediction", "leak_slope", "paper_mm", "paper_deg"),
-)
+# Files of the Linux kernel with this process's peak of memory (VmHWM), and that takes "5" to let the peak begin anew.
+STATUS, FORGET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 @dataclass(frozen=True)
@@ -138,51 +129,38 @@ def read_curves(folder: Path) -> list[dict[str, float]]:
         return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
 
 
-def ordering(rows: list[dict[str, Any]], key: str) -> list[tuple[str, float, float]]:
-    """Models sorted by a column's mean over seeds, the smallest first: name, mean, and difference between largest and smallest seed."""
-    values: dict[str, list[float]] = {}
-    for row in rows:
-        if row.get(key) is not None:
-            values.setdefault(row["model"], []).append(row[key])
-    return sorted(((name, float(np.mean(v)), float(np.ptp(v))) for name, v in values.items()), key=lambda item: item[1])
-
-
 class PeakMemory:
     """Context that measures the peak memory, in MiB above that at its start: of the GPU, or of the process's resident set on a CPU.
 
-    The resident set is known on Linux only. Elsewhere the peak is NaN.
+    The kernel's own peak of the resident set is read, which only Linux has. Elsewhere the peak is NaN.
     """
 
     def __init__(self, device: str = "cpu") -> None:
-        self.device, self.peak = device, 0.0 if device == "cuda" or STATM.exists() else float("nan")
+        self.device, self.peak = device, float("nan")
 
     def __enter__(self) -> "PeakMemory":
         gc.collect()
         # Freed memory that was not given back to the system would be reused, and the resident set would not grow.
-        if STATM.exists() and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)):
+        if FORGET.exists() and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)):
             trim(0)
-        if self.device == "cuda":
-            torch.cuda.reset_peak_memory_stats()
-        self.start, self.watching = self._now(), True
-        self.thread = threading.Thread(target=self._watch, daemon=True)
-        self.thread.start()
+        self.start = self._peak(anew=True)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.watching = False
-        self.thread.join()
-        if self.device == "cuda":
-            self.peak = torch.cuda.max_memory_allocated() / MIB - self.start
+        self.peak = self._peak() - self.start
 
-    def _watch(self) -> None:
-        while self.watching and self.device != "cuda":
-            self.peak = max(self.peak, self._now() - self.start)
-            time.sleep(WATCH_S)
-
-    def _now(self) -> float:
+    def _peak(self, *, anew: bool = False) -> float:
+        """The peak since it was measured ``anew``, MiB."""
         if self.device == "cuda":
-            return torch.cuda.memory_allocated() / MIB
-        return int(STATM.read_text(encoding="utf-8").split()[1]) * 4096 / MIB if STATM.exists() else float("nan")
+            if anew:
+                torch.cuda.reset_peak_memory_stats()
+            return torch.cuda.max_memory_allocated() / MIB
+        try:
+            if anew:
+                FORGET.write_text("5", encoding="utf-8")
+            return int(STATUS.read_text(encoding="utf-8").partition("VmHWM:")[2].split()[0]) * 1024 / MIB
+        except OSError:
+            return float("nan")
 
 
 def measure_training(model: str, pins: PinTable, inputs: Inputs, batch: int, *, device: str = "cpu") -> dict[str, Any]:

@@ -5,6 +5,7 @@ Voronoi areas. For it four contacts are rendered in the twin, each 2 and 4 mm be
 of the sensor, and a surface that reaches only its top or only its bottom. Recorded frames of about these depths are shown for comparison.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -13,17 +14,16 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 from scipy.linalg import block_diag
 
-from scenes import load_object
-from scenes.sensor import SensorSpec
+from scenes import SensorSpec, load_object
 from training.data.dataset import Dataset, load_dataset
 from training.data.pins import PinTable
-from training.data.targets import ANGLE, DEPTH
+from training.data.targets import ANGLE, DEPTH, unit_of
 from training.models import model_named
 from training.runs.loop import choose_device
-from training.studies.tac_vgnn.models import SHOWN, PlannedRun, error_columns, measure_training, plan_run, table_row, train_all
-from training.studies.tac_vgnn.page import curves_figure, efficiency_figure, write_page
+from training.studies.tac_vgnn.models import PlannedRun, error_columns, measure_training, plan_run, read_curves, table_row, train_all
 from training.surrogate.symmetry import about_z
 from twin.errors import OptionError, TwinError
 from twin.estimate import readable_labels
@@ -32,9 +32,11 @@ from twin.objects import build_field
 from twin.pins import Pipeline, make_graph
 from twin.pins.graph import GraphKind
 from twin.progress import Progress, Step, silent, stage, unheard
-from twin.report.charts import new_figure, write_chart
+from twin.report.charts import new_figure, plain_log, sized_figure, write_chart
+from twin.report.page import Page, PagePicture
 from twin.report.plots import draw_area_change
-from twin.report.table import write_table
+from twin.report.table import Column, number, write_table
+from twin.report.themes import SERIES
 from twin.simulator import Simulator
 from twin.store import writes
 from twin.types import Form, PinGraph, ReadableResult
@@ -67,6 +69,34 @@ USUAL = {"depth_mm": 0.25, "angle_deg": 1.5, "shear_mm": 0.5, "shear_deg": 0.7}
 MODELS = ("gnn", "tac-vgnn", "vgnn", "cnn-v2", "cnn-v1")
 # Batch sizes of the efficiency figure.
 BATCHES = (64, 256, 512)
+# Columns of the page's table of models that hold no errors, in the order of the table.
+SHOWN = (
+    *("model", "seed", "state", "epochs", "epochs_allowed", "training_minutes", "s_per_epoch", "parameters"),
+    *("frames", "without_prediction", "leak_slope", "paper_mm", "paper_deg"),
+)
+# Columns of the table of models that name a run.
+RUN = ("model", "seed", "state")
+# Columns about training, which are shown in a separate table.
+TRAINING = ("epochs", "epochs_allowed", "training_minutes", "s_per_epoch", "parameters")
+# Number of points up to which the points of a curve are marked, because a line of one or two points can't be seen.
+FEW = 5
+# Line styles. The next one is used when all colours are used. All seeds of a model have the same colour and style.
+LINES = ("-", "--", ":", "-.")
+# Units of scaled labels by the recipe's scaling.
+SCALINGS = {"none": "mm and deg", "standard": "standard deviations", "unit": "half ranges"}
+HEADINGS = {  # titles and units of columns of the tables that their keys do not tell
+    "s_per_epoch": ("per epoch", "s"),
+    "ms_per_frame": ("per frame", "ms"),
+    "ms": ("time", "ms"),
+    "paper_mm": ("paper, depth", "mm"),
+    "paper_deg": ("paper, angle", "deg"),
+    "paper_ms": ("paper, time", "ms"),
+    "edges_no_contact": ("edges, no contact", ""),
+    "edges_least": ("edges, least", ""),
+    "edges_most": ("edges, most", ""),
+    "growth_x_px": ("growth at x", "px"),
+    "growth_y_px": ("growth at y", "px"),
+}
 
 FILES = (
     "index.html",
@@ -80,7 +110,7 @@ def compare_graphs(pins: PinTable) -> list[dict[str, Any]]:
     chosen = np.linspace(0, len(pins) - 1, min(TIMED, len(pins))).astype(int)
     rows = []
     for kind in KINDS:
-        make_graph(kind, rest, outmost=outmost)  # not timed: the first call loads the compiled code
+        still = make_graph(kind, rest, outmost=outmost)  # not timed: the first call loads the compiled code
         taken, edges = [], []
         for k in chosen:
             started = perf_counter()
@@ -89,8 +119,7 @@ def compare_graphs(pins: PinTable) -> list[dict[str, Any]]:
             edges.append(len(graph.edges))
         paper_edges, paper_s = PAPER.get((len(rest), kind), (None, None))
         row: dict[str, Any] = {"graph": kind, "nodes": len(rest), "features": 3 if kind == "voronoi" else 2}
-        row |= {"edges_no_contact": len(make_graph(kind, rest, outmost=outmost).edges)}
-        row |= {"edges_least": min(edges), "edges_most": max(edges), "ms": float(np.median(taken))}
+        row |= {"edges_no_contact": len(still.edges), "edges_least": min(edges), "edges_most": max(edges), "ms": float(np.median(taken))}
         rows.append(row | {"paper_edges": paper_edges, "paper_ms": None if paper_s is None else 1e3 * paper_s})
     return rows
 
@@ -250,11 +279,8 @@ class TacVgnnPlan:
 
     def runs(self) -> list[PlannedRun]:
         """Every run of the study."""
-        return [
-            plan_run(name, labels=self.labels, seed=seed, split=self.split, epochs=self.epochs)
-            for seed in self.seeds
-            for name in self.models
-        ]
+        settings: dict[str, Any] = {"labels": self.labels, "split": self.split, "epochs": self.epochs}
+        return [plan_run(name, seed=seed, **settings) for seed in self.seeds for name in self.models]
 
 
 @dataclass(frozen=True, repr=False)
@@ -317,38 +343,162 @@ def run(plan: TacVgnnPlan, out: Path, *, progress: Progress = silent) -> TacVgnn
     rows = [table_row(each, data, folder, spent.get(each.folder)) for each in runs]
     written = [write_table(out / "models.csv", rows), write_table(out / "graphs.csv", graphs)]
     written.append(write_chart(out / "curves.png", lambda: curves_figure(runs, folder)))
-    efficiency = _efficiency(plan, runs, data, device, progress)
-    if efficiency:
+    efficiency: list[dict[str, Any]] = []
+    if plan.batches:
+        models = list(dict.fromkeys(each.config.model for each in runs))
+        with stage(progress, "training efficiency") as step:
+            for model in models:
+                inputs = model_named(model).prepare(data, np.arange(len(data))).inputs
+                for batch in plan.batches:
+                    efficiency.append(measure_training(model, data.pins, inputs, batch, device=device))
+                    step(len(efficiency), len(models) * len(plan.batches))
         chart = write_chart(out / "efficiency.png", lambda: efficiency_figure(efficiency))
         written += [write_table(out / "efficiency.csv", efficiency), chart]
-    changes = _contacts(plan, data, progress)
+    changes = recorded_contacts(data)
+    if plan.contacts:
+        with stage(progress, "contacts") as step:
+            changes = twin_contacts(data.pins.sensor, data.pins.form, progress=step) + changes
     contacts = [change.figures() for change in changes]
     if contacts:
         written += [write_table(out / "contacts.csv", contacts), write_chart(out / "contacts.png", lambda: contacts_figure(changes))]
     notes = {"device": device, "threads": torch.get_num_threads(), "labels": plan.labels, "max_minutes": plan.max_minutes}
     notes["columns"] = [*SHOWN, *error_columns(data)]
-    written.append(write_page(out, data=data, models=rows, graphs=graphs, efficiency=efficiency, contacts=contacts, notes=notes))
+    tables = {"models": rows, "graphs": graphs, "efficiency": efficiency, "contacts": contacts}
+    written.append(write_page(out, data, tables, notes))
     return TacVgnnResult(rows, graphs, efficiency, contacts, data.targets.names, len(data), written)
 
 
-def _efficiency(plan: TacVgnnPlan, runs: list[PlannedRun], data: Dataset, device: str, progress: Progress) -> list[dict[str, Any]]:
-    """Time and memory of training for each model and batch size."""
-    if not plan.batches:
-        return []
-    models, rows = list(dict.fromkeys(each.config.model for each in runs)), []
-    with stage(progress, "training efficiency") as step:
-        for model in models:
-            inputs = model_named(model).prepare(data, np.arange(len(data))).inputs
-            for batch in plan.batches:
-                rows.append(measure_training(model, data.pins, inputs, batch, device=device))
-                step(len(rows), len(models) * len(plan.batches))
-    return rows
+def write_page(out: Path, data: Dataset, tables: Mapping[str, list[dict]], notes: dict) -> Path:
+    """Write ``index.html``, which shows all tables and charts in the same folder.
+
+    Parameters
+    ----------
+    out : Path
+    data : Dataset
+    tables : mapping of str to list of dict
+        Rows of the tables ``models``, ``graphs``, ``efficiency`` and ``contacts``; the last two may be empty.
+    notes : dict
+        ``columns`` of the table of models, kind of ``labels`` that were used, ``max_minutes``, ``device`` and ``threads``.
+    """
+    ranges = ", ".join(
+        f"{name} [{number(float(data.targets.raw[:, k].min()))}, {number(float(data.targets.raw[:, k].max()))}] {unit}"
+        for k, (name, unit) in enumerate(zip(readable_labels(data.targets.names), data.targets.units, strict=True))
+    )
+    page = Page(
+        f"The Tac-VGNN paper's comparison on {data.pins.sensor.name}",
+        "twin study tac-vgnn",
+        topic="TacTip twin: study",
+        lead=f"{len(data)} labelled frames. The paper used other data: depth [-2, 2] mm and angle [-30, 30] deg; here {ranges}. Its "
+        "figures are shown for orientation; equal figures would not mean equal models. Times are of this machine "
+        f"({notes['device']}, {notes['threads']} threads), the paper's of a Titan Xp.",
+    )
+    page.notice("Notes on the recording", data.problems)
+    minutes = notes["max_minutes"]
+    given = "" if minutes is None else f" This time {number(minutes, 4)} minutes were given to all training together."
+    page.section(
+        "Errors",
+        "Mean absolute errors on the random fifth of the frames that are kept out of all training (every frame counts; those without a "
+        f"prediction are listed), of models that were trained on {notes['labels']} labels. Corrected labels have the shear moves that were "
+        "never executed taken out. The leak slope is that of the angle's error on such moves: a model that reads the contact has 0, one "
+        f"that reads the time of the frame has not.{given} The error of a run that ended early is what it reached in its time, not what it "
+        "would reach. The least error of each column is marked.",
+    )
+    errors = error_columns(data)
+    shown = [key for key in notes["columns"] if key not in TRAINING]
+    shown.sort(key=lambda key: (key not in RUN, key not in errors))  # the run, its errors, the rest
+    page.table(tables["models"], [_column(key, errors) for key in shown])
+    page.table(tables["models"], [_column(key) for key in (*RUN, *TRAINING)], caption="What training took")
+    for key in errors:
+        if order := ordering(tables["models"], key):
+            said = ", ".join(
+                f"{name} {number(mean)}" + (f" (seeds within {number(spread, 2)})" if spread else "") for name, mean, spread in order
+            )
+            page.text(f"By {key.replace('_', ' ')}, best first: {said}.")
+    page.text(
+        "The paper: depth Tac-VGNN 0.05, CNN (ver 1) 0.06, CNN (ver 2) 0.07, GNN 0.07 mm; angle Tac-VGNN 1.02, GNN 1.16, CNN (ver 1) 1.20, "
+        "CNN (ver 2) 1.25 deg."
+    )
+    page.figures(PagePicture(out / "curves.png", "Learning curves against epochs and against time"))
+    page.section("Graphs")
+    page.table(tables["graphs"], [_column(key) for key in tables["graphs"][0]])
+    page.text("Edges are directed; times are medians from found pins to the finished graph on one thread.")
+    if efficiency := tables["efficiency"]:
+        page.section(
+            "Training efficiency",
+            "Graphs were built before the clock started. An epoch's time is given only where a whole epoch was run; of the convolutional "
+            "networks some batches were timed. Ours sees every frame twice in an epoch.",
+        )
+        page.table(efficiency, [_column(key) for key in efficiency[0]])
+        page.figures(PagePicture(out / "efficiency.png", "Time of training against batch size", width_px=760))
+    if contacts := tables["contacts"]:
+        page.section(
+            "What the areas show",
+            "Change of the Voronoi areas against no contact. Depth is beyond first touch. The place of growth is that of the grown cells, "
+            "weighted, from the middle of the pins; y is down. Recorded frames are those nearest to a straight press without shear.",
+        )
+        page.figures(PagePicture(out / "contacts.png", "Change of the Voronoi areas of each contact, shallow above deep"))
+        page.table(contacts, [_column(key) for key in contacts[0]])
+    for name in [name for name, rows in tables.items() if rows]:
+        page.download(out / f"{name}.csv")
+    return page.write(out / "index.html")
 
 
-def _contacts(plan: TacVgnnPlan, data: Dataset, progress: Progress) -> list[AreaChange]:
-    """Contacts of the twin if they are asked for, and recorded contacts."""
-    recorded = recorded_contacts(data)
-    if not plan.contacts:
-        return recorded
-    with stage(progress, "contacts") as step:
-        return twin_contacts(data.pins.sensor, data.pins.form, progress=step) + recorded
+def ordering(rows: list[dict[str, Any]], key: str) -> list[tuple[str, float, float]]:
+    """Models sorted by a column's mean over seeds, the smallest first: name, mean, and difference between largest and smallest seed."""
+    values: dict[str, list[float]] = {}
+    for row in rows:
+        if row.get(key) is not None:
+            values.setdefault(row["model"], []).append(row[key])
+    return sorted(((name, float(np.mean(v)), float(np.ptp(v))) for name, v in values.items()), key=lambda item: item[1])
+
+
+def _column(key: str, errors: Sequence[str] = ()) -> Column:
+    if key in errors:
+        name, _, kind = key.rpartition("_")
+        return Column(key, f"{name}, {kind}", unit_of(name), digits=2, best="least")
+    if key == "leak_slope":
+        return Column(key, "leak slope", digits=2, signed=True)
+    title, unit = HEADINGS.get(key, ("", ""))
+    return Column(key, title, unit, digits=2 if key.startswith("paper") else 3) if title else Column.of(key)
+
+
+def efficiency_figure(rows: Sequence[Mapping]) -> Figure:
+    """Times of training against batch size, a line for each model; the area of a marker is the memory."""
+    figure, (ax,) = sized_figure((7.0, 4.6))
+    for model in dict.fromkeys(row["model"] for row in rows):
+        mine = [row for row in rows if row["model"] == model]
+        batches, times = [row["batch"] for row in mine], [row["ms_per_frame"] for row in mine]
+        (line,) = ax.plot(batches, times, linewidth=1)
+        ax.scatter(batches, times, s=[max(row["memory_mib"] / 4, 4) for row in mine], color=line.get_color(), alpha=0.6, label=model)
+    ax.set(xscale="log", yscale="log", xlabel="batch", ylabel="ms per frame in training", title="marker's area: memory")
+    batches = sorted({row["batch"] for row in rows})
+    ax.set_xticks(batches, [number(batch) for batch in batches])
+    ax.xaxis.set_minor_locator(NullLocator())
+    plain_log(ax.yaxis)
+    ax.legend(markerscale=0.5)
+    return figure
+
+
+def curves_figure(plans: Sequence[PlannedRun], folder: Path) -> Figure:
+    """Learning curves of the runs in a folder that were begun, against epochs and against time."""
+    plans = [plan for plan in plans if (folder / plan.folder / "curves.csv").is_file()]
+    figure, axes = new_figure(2, panel_inch=5)
+    first = {plan.name: plan for plan in reversed(plans)}  # of each name, which alone is labelled
+    names = list(dict.fromkeys(plan.name for plan in plans))
+    for plan in plans:
+        curve = [point for point in read_curves(folder / plan.folder) if point["network"] == 0]
+        error, minutes = [point["held_out_error"] for point in curve], np.cumsum([point["seconds"] / 60 for point in curve])
+        rank = names.index(plan.name)
+        look = {"color": SERIES[rank % len(SERIES)], "linestyle": LINES[rank // len(SERIES) % len(LINES)], "linewidth": 1.2}
+        look["marker"] = "." if len(curve) < FEW else None
+        label = f"{plan.name} ({SCALINGS[plan.config.recipe.scaling]})" if plan is first[plan.name] else None
+        axes[0].plot(range(1, len(curve) + 1), error, label=label, **look)
+        axes[1].plot(minutes, error, **look)
+    for ax, label in zip(axes, ("epoch", "minutes of training"), strict=True):
+        ax.set(xlabel=label, ylabel="mean error of the scaled labels", xscale="log", yscale="log")
+        if plans:
+            plain_log(ax.xaxis)
+            plain_log(ax.yaxis)
+    if plans:
+        axes[0].legend(fontsize=7)
+    return figure

@@ -11,7 +11,7 @@ from scenes import load_object
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
-from twin.calibration.contact.fit import fit_contact, held_out_px, simulate
+from twin.calibration.contact.fit import before_and_after, fit_contact, held_out_px
 from twin.calibration.contact.forces import FILES, FORCE_PARAMETERS, ForceComparison, ForceSetup, compare_table, is_table
 from twin.calibration.contact.newtons import MOST_PRESSES, Newtons, assume_stiffness, compare_forces, pressed_n
 from twin.calibration.contact.parameters import PARAMETERS
@@ -142,14 +142,12 @@ def calibrate_to_file(
     if unknown := set(hold) - set(names):
         raise OptionError(f"`hold` {', '.join(sorted(unknown))}: no such parameter; known: {', '.join(sorted(names))}")
     folder = sibling_folder(out, "contact")
-    parameters = tuple(parameter for parameter in PARAMETERS if parameter.name not in hold)
+    of_pins, of_forces = (tuple(each for each in every if each.name not in hold) for every in (PARAMETERS, FORCE_PARAMETERS))
     obj = obj or load_object(experiment.object)
     if is_table(frames):
-        free = tuple(parameter for parameter in FORCE_PARAMETERS if parameter.name not in hold)
+        table = ForceSetup(sensor, experiment, obj, across, workers, of_forces)
         with output(folder, *FILES):
-            forces = compare_table(
-                frames, ForceSetup(sensor, experiment, obj, across, workers, free), folder, columns, labels, seed, progress
-            )
+            forces = compare_table(frames, table, folder, columns, labels, seed, progress)
         write_sensor(out, forces.sensor, "\n".join([f"Contact fitted to {frames.name}, starting from {sensor.name}.", *forces.lines()]))
         return replace(forces, written=[out, *forces.written])
     with output(folder, "index.html", "calibration.json", "*.png", "contacts"), stage(progress, "contacts") as step:
@@ -157,13 +155,12 @@ def calibrate_to_file(
         order = np.random.default_rng(seed).permutation(len(measured))  # the frames come in the order of the recording's table
         fitted, held = _part(measured, np.sort(order[:labels])), _part(measured, np.sort(order[labels:]))
         spec = sensor.alter(rig=rig_of(sensor, obj.name))
-        setup = CalibrationSetup(spec, experiment, obj, measured.form, across, folder / "contacts", workers, parameters)
+        setup = CalibrationSetup(spec, experiment, obj, measured.form, across, folder / "contacts", workers, of_pins)
         fit = fit_contact(setup, fitted, progress=step)
         error = held_out_px(setup, fit, held, progress=step) if len(held) else None
         newtons = scale_forces(frames, fit.sensor, experiment, obj, seed, across=across, form=form)
         summary = summary_of(setup, fitted, fit, error, len(held)) | {"newtons": asdict(newtons)}
-        pairs = ((fit.start, rig_of(spec).turn_sign), (fit.value, rig_of(fit.sensor).turn_sign))
-        moved = np.stack([simulate(setup, fitted, [values], sign)[0] for values, sign in pairs]).swapaxes(1, 2)
+        moved = before_and_after(setup, fit, fitted).swapaxes(1, 2)
         page = write_calibration(folder, replace(fitted, no_contact_px=fit.rest_px), moved, fit, summary)
     found = newtons.of(fit.sensor)
     text = f"Contact fitted to {summary['fitted_px']['frames']} frames of {frames.name}, starting from {sensor.name}."

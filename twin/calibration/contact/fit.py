@@ -129,22 +129,12 @@ def fit_contact(setup: CalibrationSetup, measured: MeasuredFrames, *, progress: 
     sd = np.sqrt(np.diag(covariance))
     shipped = values_of(setup.sensor, setup.experiment, setup.parameters)
     first = simulate(setup, measured, [shipped], rig_of(setup.sensor).turn_sign, progress)[0]
-    sensor = with_quantities(setup.sensor, setup.experiment, value, sign, setup.parameters)
-    rest_px = measured.no_contact_px + shift
-    return ContactFit(
-        sensor=sensor if seen_at_rest else at_rest(sensor, measured.form, rest_px),
-        start=shipped,
-        value=value,
-        sd=sd,
-        determined=1 - (sd / prior) ** 2,
-        correlation=covariance / np.outer(sd, sd),
-        executed=weights.executed,
-        trust=weights.trust,
-        before_px=likelier_px(first, target),
-        after_px=likelier_px(moved, target - shift),
-        share=weights.share,
-        rest_px=rest_px,
-    )
+    sensor, rest_px = with_quantities(setup.sensor, setup.experiment, value, sign, setup.parameters), measured.no_contact_px + shift
+    sensor = sensor if seen_at_rest else at_rest(sensor, measured.form, rest_px)
+    determined, correlation = 1 - (sd / prior) ** 2, covariance / np.outer(sd, sd)
+    before_px, after_px = likelier_px(first, target), likelier_px(moved, target - shift)
+    executed, trust, share = weights.executed, weights.trust, weights.share
+    return ContactFit(sensor, shipped, value, sd, determined, correlation, executed, trust, before_px, after_px, share, rest_px)
 
 
 def _search_values(
@@ -198,13 +188,16 @@ def shorten_step(
 
 def held_out_px(setup: CalibrationSetup, fit: ContactFit, measured: MeasuredFrames, *, progress: Step = unheard) -> tuple[float, float]:
     """Mean pin error, before and after, on held-out frames. Each frame's error is that of the hypothesis that fits it better."""
+    before, after = before_and_after(setup, fit, measured, progress)
     target = measured.pins_px - measured.no_contact_px
-    errors = []
-    ends = ((fit.start, rig_of(setup.sensor).turn_sign, measured.no_contact_px), (fit.value, rig_of(fit.sensor).turn_sign, fit.rest_px))
-    for values, sign, rest_px in ends:
-        moved = simulate(setup, measured, [values], sign, progress)[0]
-        errors.append(float(np.nanmean(likelier_px(moved, target - (rest_px - measured.no_contact_px)))))
-    return errors[0], errors[1]
+    errors = likelier_px(before, target), likelier_px(after, target - (fit.rest_px - measured.no_contact_px))
+    return float(np.nanmean(errors[0])), float(np.nanmean(errors[1]))
+
+
+def before_and_after(setup: CalibrationSetup, fit: ContactFit, measured: MeasuredFrames, progress: Step = unheard) -> np.ndarray:
+    """(2, M, 2, N, 2) px with the values at the start and at the end of a fit."""
+    ends = ((fit.start, rig_of(setup.sensor).turn_sign), (fit.value, rig_of(fit.sensor).turn_sign))
+    return np.stack([simulate(setup, measured, [values], sign, progress)[0] for values, sign in ends])
 
 
 def likelier_px(moved: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -239,10 +232,8 @@ def _start(setup: CalibrationSetup, measured: MeasuredFrames, target: np.ndarray
     by_move = np.argsort([-np.abs(label.move[:3]).max() for label in measured.labels])[:START_FRAMES]
     telling = np.union1d(by_turn, by_move)
     turns = np.array([p.name == "rig.image_turn_deg" for p in setup.parameters])
-    tries = []
-    for degrees, sign in product(TURNS_DEG if turns.any() else (0.0,), (1, -1)):
-        tried = value + degrees * turns
-        tries.append((tried, sign * rig_of(setup.sensor).turn_sign))
+    own, turns_deg = rig_of(setup.sensor).turn_sign, TURNS_DEG if turns.any() else (0.0,)
+    tries = [(value + degrees * turns, sign * own) for degrees, sign in product(turns_deg, (1, -1))]
     jobs = [(tried, sign, int(row)) for tried, sign in tries for row in telling]
     moved = setup.displacements(jobs, measured.labels, progress).reshape(len(tries), len(telling), 2, -1, 2)
     errors = [np.mean(likelier_px(each, target[telling])) for each in moved]

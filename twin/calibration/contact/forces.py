@@ -365,18 +365,13 @@ def compare_table(
     poses, moves = poses_and_moves(arm)
     of = {"depth": poses[:, 2:3], "tilt": poses[:, 3:5], "shear": moves[:, :2], "twist": moves[:, 5:], "slip": both[1, :, 6:]}
     by = {key: np.linalg.norm(each, axis=1) if key != "depth" else each[:, 0] for key, each in of.items()}
-    error, solved = simulated - measured, np.isfinite(simulated).all(axis=1)
-    parts = {}
+    error, solved, parts = simulated - measured, np.isfinite(simulated).all(axis=1), {}
+    inside = abs(error) <= half
     for part, mine in (("fitted", fitted), ("evaluated", ~fitted)):
         if mine.any():
             before, after = (np.nanmean(abs(of - measured)[mine], axis=0).tolist() for of in (first, simulated))
             lines = [_regress(simulated[mine & solved, k], measured[mine & solved, k])[:2] for k in range(3)]
-            parts[part] = {
-                "rows": int(mine.sum()),
-                "before_n": before,
-                "error_n": after,
-                "inside": float((abs(error) <= half)[mine].mean()),
-            }
+            parts[part] = {"rows": int(mine.sum()), "before_n": before, "error_n": after, "inside": float(inside[mine].mean())}
             parts[part] |= {"scale": [slope.real for slope, _ in lines], "correlation": [float(np.sqrt(1 - left)) for _, left in lines]}
     evaluated = ~fitted & solved if (~fitted & solved).sum() > FEWEST_ROWS else solved
     left = [

@@ -28,12 +28,8 @@ ALIKE = 0.9
 
 def summary_of(setup: CalibrationSetup, measured: MeasuredFrames, fit: ContactFit, held_out: tuple | None, held_frames: int) -> dict:
     """All figures, as ``calibration.json`` holds them."""
-    pairs = [
-        [setup.parameters[i].name, setup.parameters[k].name, float(fit.correlation[i, k])]
-        for i in range(len(setup.parameters))
-        for k in range(i)
-        if abs(fit.correlation[i, k]) >= ALIKE
-    ]
+    names, alike = [parameter.name for parameter in setup.parameters], np.argwhere(np.tril(abs(fit.correlation) >= ALIKE, -1))
+    pairs = [[names[i], names[k], float(fit.correlation[i, k])] for i, k in alike]
     frames: list[dict] = [
         {"image_name": name, "executed": float(executed), "trust": float(trust), "before_px": _number(before), "after_px": _number(after)}
         for name, executed, trust, before, after in zip(measured.names, fit.executed, fit.trust, fit.before_px, fit.after_px, strict=True)
@@ -57,17 +53,14 @@ def summary_of(setup: CalibrationSetup, measured: MeasuredFrames, fit: ContactFi
 
 def warnings_of(fit: ContactFit, held_out: tuple | None, held_frames: int) -> list[str]:
     """Warnings about everything that is worse than before the fit, or unknown; empty if there are none."""
-    found = []
-    if not held_out:
-        found.append("no held-out frame is left, so the error on other frames is not known; give more frames, or a smaller `num_labelled`")
-    pairs = {"the fitted frames": (float(np.nanmean(fit.before_px)), float(np.nanmean(fit.after_px)))}
+    found, pairs = [], {"the fitted frames": (np.nanmean(fit.before_px), np.nanmean(fit.after_px))}
     if held_out:
         pairs[f"the {held_frames} held-out frames"] = held_out
-    for frames, (before, after) in pairs.items():
+    else:
+        found.append("no held-out frame is left, so the error on other frames is not known; give more frames, or a smaller `num_labelled`")
+    for on, (before, after) in pairs.items():
         if not after <= before:
-            found.append(
-                f"the fit ended worse than it began on {frames}: {before:.2f} -> {after:.2f} px; look at the page before you use it"
-            )
+            found.append(f"the fit ended worse than it began on {on}: {before:.2f} -> {after:.2f} px; look at the page before you use it")
     return found
 
 
@@ -83,11 +76,7 @@ def write_calibration(folder: Path, measured: MeasuredFrames, moved: np.ndarray,
     solved = np.flatnonzero(np.isfinite(fit.after_px) & np.isfinite(fit.before_px) & (fit.trust >= TRUSTED))
     chosen = solved[np.argsort(fit.before_px[solved])[[len(solved) // 2, -1]]] if len(solved) else solved
     page = Page(f"Contact of {summary['sensor']}", "twin calibrate contact", topic="TacTip twin: contact calibration", lead=_lead(summary))
-    page.notice(
-        "Labels that are not trusted, because neither hypothesis fits",
-        [", ".join(summary["distrusted"])] if summary["distrusted"] else [],
-        tone="bad",
-    )
+    page.notice("Labels that are not trusted, because neither hypothesis fits", summary["distrusted"], tone="bad")
     page.notice("Warnings", summary["warnings"], tone="bad")
     page.notice("Notes", [summary["newtons"]["explanation"], *summary["problems"]])
     _parameters_section(page, summary)
@@ -112,18 +101,14 @@ def write_calibration(folder: Path, measured: MeasuredFrames, moved: np.ndarray,
 
 
 def _lead(summary: dict) -> str:
-    def px(key: str, part: str) -> str:
-        return number(summary[key][part], decimals=2)
-
-    held = ""
-    if summary["held_out_px"]:
-        frames = summary["held_out_px"]["frames"]
-        held = f"; on {frames} held-out frames {px('held_out_px', 'before')} and {px('held_out_px', 'after')} px"
+    fitted, held, others = summary["fitted_px"], summary["held_out_px"], ""
+    before, after = (number(fitted[part], decimals=2) for part in ("before", "after"))
+    if held:
+        others = f"; on {held['frames']} held-out frames {number(held['before'], decimals=2)} and {number(held['after'], decimals=2)} px"
     return (
-        f"Fitted to {summary['fitted_px']['frames']} labelled frames of {summary['experiment']}: mean pin error "
-        f"{px('fitted_px', 'before')} px before, {px('fitted_px', 'after')} px after{held}. Each frame counts under "
-        f"its likelier hypothesis: "
-        f"move executed, or tap alone. Moves executed: {100 * summary['executed_share']:.0f} %."
+        f"Fitted to {fitted['frames']} labelled frames of {summary['experiment']}: mean pin error {before} px before, {after} px after"
+        f"{others}. Each frame counts under its likelier hypothesis: move executed, or tap alone. Moves executed: "
+        f"{100 * summary['executed_share']:.0f} %."
     )
 
 
@@ -162,14 +147,12 @@ def add_parameters(page: Page, parameters: list[dict], by: str, **spread: str) -
 
 def _parameters_section(page: Page, summary: dict) -> None:
     page.section("Parameters")
-    add_parameters(
-        page, [*summary["parameters"], {"name": "rig.turn_sign", "told": "", "known": True} | summary["turn_sign"]], "frames", sd="sd"
-    )
-    independent = f"{summary['independent_numbers_a_frame']:.0f}"
+    sign = {"name": "rig.turn_sign", "told": "", "known": True} | summary["turn_sign"]
+    add_parameters(page, [*summary["parameters"], sign], "frames", sd="sd")
     page.text(
-        "Determined by the frames: the share by which they reduce the prior uncertainty. A parameter that they do not determine "
-        "(red) stays near its start. "
-        f"The sd counts a frame's pins as {independent} independent numbers, because all pins share the model's own errors."
+        "Determined by the frames: the share by which they reduce the prior uncertainty. A parameter that they do not determine (red) "
+        f"stays near its start. The sd counts a frame's pins as {summary['independent_numbers_a_frame']:.0f} independent numbers, because "
+        "all pins share the model's own errors."
     )
     if alike := summary["hardly_told_apart"]:
         said = "; ".join(f"{a} and {b} ({number(r, decimals=2, signed=True)})" for a, b, r in alike)

@@ -55,10 +55,8 @@ class CalibrationSetup:
     def displacements(self, jobs: list[tuple], labels: list[ArmLabel], progress: Step = unheard) -> np.ndarray:
         """(J, 2, N, 2) px after tap and after move, for jobs of (values (P,), turn_sign, row of ``labels``); NaN if the contact failed."""
         shared = inputs_digest(replace(self, folder=Path(), workers=1))
-        tasks = [
-            (k, np.asarray(values, float), int(sign), ArmLabel(labels[row].pose, labels[row].move))
-            for k, (values, sign, row) in enumerate(jobs)
-        ]
+        moves = [ArmLabel(label.pose, label.move) for label in labels]  # as if they had been executed
+        tasks = [(k, np.asarray(values, float), int(sign), moves[row]) for k, (values, sign, row) in enumerate(jobs)]
         items = [Item("contact", (__name__,), [shared, *task[1:]]) for task in tasks]
         found = {k: kept["displacements_px"] for k, item in enumerate(items) if (kept := find_arrays(self.folder, item)) is not None}
         todo = [task for task in tasks if task[0] not in found]

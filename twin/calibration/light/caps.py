@@ -5,7 +5,7 @@ and glints do not change its median over the frames. The outline follows from a 
 r(t) grows by dr(t), the image changes by ``-grad I . dr(t) e(t)``, where e(t) is the outward direction at the azimuth t in the picture.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import cv2
 import numpy as np
@@ -33,28 +33,25 @@ DAMPING = 0.8
 # Weight of the prior of contrast and skin level. Both are free, so the weight is only large enough to make the equations solvable.
 FREE = 1e-6
 
-# render(spec, frames) gives the captured renders (H, W[, 3]) uint8 of the frames' states, without noise.
-RenderCaps = Callable[[SensorSpec, list[Aligned]], Sequence[np.ndarray]]
 
-
-def fit_caps(spec: SensorSpec, frames: list[Aligned], render: RenderCaps) -> SensorSpec:
+def fit_caps(spec: SensorSpec, frames: list[Aligned], rendered: Sequence[np.ndarray]) -> SensorSpec:
     """Correct the reflectance and the outline of every cap once.
 
     Parameters
     ----------
     spec : SensorSpec
     frames : list of Aligned
-    render : callable
-        Renders the frames' states under a specification.
+    rendered : sequence of (H, W[, 3]) uint8
+        Captured renders of the frames' states under this specification, without noise.
 
     Returns
     -------
     SensorSpec
         The specification with new ``appearance.cap_levels``, ``cap_shapes`` and ``cap_offsets``.
     """
-    rendered, look, count = render(spec, frames), spec.appearance, spec.pins.count
+    look, count = spec.appearance, spec.pins.count
     level = np.array([_levels(spec.response, f, f.image) / _levels(spec.response, f, r) for f, r in zip(frames, rendered, strict=True)])
-    level = np.nan_to_num(_median(level), nan=1.0)
+    level = np.nanmedian(np.where(np.isfinite(level).any(axis=0), level, 1.0), axis=0)
     levels = np.clip(np.array(look.cap_levels or np.ones(count)) * level**DAMPING, *LEVEL_BOUNDS)
     before = np.zeros((count, 2 * ORDERS + 1))
     if look.cap_offsets:
@@ -115,16 +112,10 @@ def _changes(spec: SensorSpec, frame: Aligned, image: np.ndarray) -> Iterator[tu
 
 def _levels(response: ResponseSpec, frame: Aligned, image: np.ndarray) -> np.ndarray:
     """Light (N,) of the caps' middles, 3 x 3 px, summed over the channels; NaN if lost or saturated."""
-    image = image if image.ndim == 3 else image[..., None]
+    image = np.atleast_3d(image)
     mean = cv2.blur(image.astype(np.float32), (3, 3)).reshape(image.shape)
     seen = np.isfinite(frame.pins_px).all(axis=1)
     at = np.rint(np.where(seen[:, None], frame.pins_px, 0)).astype(int)
     levels = mean[at[:, 1], at[:, 0]]
     light = to_light(levels, response).sum(axis=1)
     return np.where(seen & (levels < SATURATED).all(axis=1), np.maximum(light, 1e-6), np.nan)
-
-
-def _median(values: np.ndarray) -> np.ndarray:
-    """Median (N,) over the frames (M, N). If no frame has a value it is NaN, without a warning."""
-    some = np.isfinite(values).any(axis=0)
-    return np.where(some, np.nanmedian(np.where(some, values, 1.0), axis=0), np.nan)

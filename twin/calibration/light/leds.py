@@ -1,6 +1,6 @@
 """Fit of the LEDs: azimuths to their glow on the ring, place and shape to their reflections in the window."""
 
-from dataclasses import dataclass
+from functools import partial
 from itertools import product
 
 import cv2
@@ -90,106 +90,75 @@ def _glow_by_degree(still: Still, housing: HousingSpec, pupil_mm: float, respons
     return gaussian_filter1d(glow, GLOW_SMOOTH_DEG, mode="wrap")
 
 
-@dataclass(frozen=True)
-class _Reflections:
-    """Visible reflections of n LEDs, and the constants of their fit.
-
-    Attributes
-    ----------
-    leds : list of int
-        Index of the LED of each reflection.
-    azimuth_rad : (n,) float
-        Azimuth of each reflection's middle, which is that of its LED.
-    radius_mm, z_mm : float
-        The LEDs' radius from the reflections' middles, and their height, which is held.
-    rays : (n, s, s, SUBPIXELS, SUBPIXELS, 2) float
-        Tangents in air of the places in the squares that are compared.
-    used : (n, s, s) bool
-        Pixels of the squares that lie in the disc.
-    levels : (n, s, s, 3) float
-        Gray levels of the squares.
-    background : list of (3,) float
-        Light around each reflection.
-    """
-
-    leds: list[int]
-    azimuth_rad: np.ndarray
-    radius_mm: float
-    z_mm: float
-    rays: np.ndarray
-    used: np.ndarray
-    levels: np.ndarray
-    background: list[np.ndarray]
-
-
 def fit_reflections(spec: SensorSpec, still: Still) -> SensorSpec:
     """The specification with LEDs whose modelled reflections in the window have the place and the look of the real ones.
 
     Radius, size, core, azimuths and the share of the light that shows are fitted. An LED without a visible reflection keeps its azimuth.
     If no reflection is visible, the specification is returned unchanged.
     """
-    seen = _find_reflections(spec, still)
-    if seen is None:
+    disc = lens_disc(spec.view, spec.housing)
+    hearts = {k: at for k in lit_leds(spec.leds) if (at := _heart_px(still, disc, spec.leds.azimuth_deg[k])) is not None}
+    if not hearts:
         return spec
-    found, least = spec, np.inf
+    seen, found, least = _Reflections(spec, still, disc, hearts), spec, np.inf
     for share in MIRROR_SHARES:
-        fitted, squares = _with_reflections(with_changes(spec, leds={"mirror_share": share}), seen)
+        fitted, squares = seen.fit(with_changes(spec, leds={"mirror_share": share}))
         if squares < DIMMER_BETTER * least:
             found, least = fitted, squares
     return found
 
 
-def _with_reflections(spec: SensorSpec, seen: _Reflections) -> tuple[SensorSpec, float]:
-    """The specification with LEDs fitted to reflections, and the sum of squared differences that is left."""
-
-    def residual(values: np.ndarray) -> np.ndarray:
-        return _reflection_misfit(spec, seen, values)
-
-    low, high = np.array([*np.log(list(BOUNDS.values())), *[(-MOST_TURN_RAD, MOST_TURN_RAD)] * len(seen.leds)]).T
-    no_turn = np.zeros(len(seen.leds))
-    starts = [np.append(np.log([*start, 1.0]), no_turn) for start in product(START_SIZES_MM, START_RESTS, START_CORES_MM)]
-    first = min(starts, key=lambda values: float(np.abs(residual(values)).sum()))
-    found = fit_bounded(residual, first, low, high)
-    azimuth_deg = np.array(spec.leds.azimuth_deg)
-    azimuth_deg[seen.leds] = np.degrees(seen.azimuth_rad + found[4:])
-    fitted = with_changes(spec, leds=_led_shape(seen, found) | {"azimuth_deg": tuple((azimuth_deg % 360).tolist())})
-    return fitted, float((residual(found) ** 2).sum())
-
-
-def _find_reflections(spec: SensorSpec, still: Still) -> _Reflections | None:
-    """The reflections in the still picture; None if there are none.
+class _Reflections:
+    """The reflections of n LEDs, whose bright middles are ``hearts``, in squares of the still picture, and the fit of the LEDs to them.
 
     The mirror image of an LED at the height z_led is at ``2 back - z_led``. A ray of tangent t from the pupil meets that plane at the
     distance ``t (2 back - z_led + distance)`` from the axis. Therefore only the ratio of radius to that height can be measured. The height
     is held (behind the window), and the radius follows.
     """
-    lens = spec.lens
-    z_mm = float(np.clip(spec.leds.z_mm, lens.back_mm - BEHIND_MM[1], lens.back_mm - BEHIND_MM[0]))
-    straight_mm = 2 * lens.back_mm - z_mm + spec.camera.distance_mm
-    disc = lens_disc(spec.view, spec.housing)
-    hearts = {k: at for k in lit_leds(spec.leds) if (at := _heart_px(still, disc, spec.leds.azimuth_deg[k])) is not None}
-    if not hearts:
-        return None
-    at_px = np.array(list(hearts.values()))
-    tangents = sample_field(still.tangents, at_px)
-    side = np.arange(-PATCH_PX, PATCH_PX + 1)
-    patches = np.rint(at_px).astype(int)[:, None, None] + np.stack(np.meshgrid(side, side), axis=-1)
-    patches = np.clip(patches, 0, np.array(still.gray.shape[::-1]) - 1)  # (n, s, s, 2)
-    used = disc.distance_px(patches) < disc.radius_px - RIM_PX
-    levels = still.image[patches[..., 1], patches[..., 0]]
-    return _Reflections(
-        leds=list(hearts),
-        azimuth_rad=np.arctan2(tangents[:, 1], tangents[:, 0]),
-        radius_mm=float(straight_mm * np.median(np.linalg.norm(tangents, axis=1))),
-        z_mm=z_mm,
-        rays=sample_field(still.tangents, patches[..., None, None, :] + subpixel_offsets()),
-        used=used,
-        levels=levels,
-        background=[
-            to_light(np.percentile(level[inside], BACKGROUND_PERCENTILE, axis=0), spec.response)
-            for level, inside in zip(levels, used, strict=True)
-        ],
-    )
+
+    def __init__(self, spec: SensorSpec, still: Still, disc: Disc, hearts: dict[int, np.ndarray]) -> None:
+        self._leds, at_px, back_mm = list(hearts), np.array(list(hearts.values())), spec.lens.back_mm
+        tangents = sample_field(still.tangents, at_px)
+        self._azimuth_rad = np.arctan2(tangents[:, 1], tangents[:, 0])  # of a reflection's middle, which is that of its LED
+        self._z_mm = float(np.clip(spec.leds.z_mm, back_mm - BEHIND_MM[1], back_mm - BEHIND_MM[0]))
+        straight_mm = 2 * back_mm - self._z_mm + spec.camera.distance_mm
+        self._radius_mm = float(straight_mm * np.median(np.linalg.norm(tangents, axis=1)))
+        side = np.arange(-PATCH_PX, PATCH_PX + 1)
+        patches = np.rint(at_px).astype(int)[:, None, None] + np.stack(np.meshgrid(side, side), axis=-1)
+        patches = np.clip(patches, 0, np.array(still.gray.shape[::-1]) - 1)  # (n, s, s, 2)
+        self._rays = sample_field(still.tangents, patches[..., None, None, :] + subpixel_offsets())
+        self._used = disc.distance_px(patches) < disc.radius_px - RIM_PX
+        self._levels = still.image[patches[..., 1], patches[..., 0]]
+        around = [np.percentile(level[used], BACKGROUND_PERCENTILE, axis=0) for level, used in zip(self._levels, self._used, strict=True)]
+        self._background = [to_light(level, spec.response) for level in around]
+
+    def fit(self, spec: SensorSpec) -> tuple[SensorSpec, float]:
+        """The specification with LEDs fitted to the reflections, and the sum of squared differences that is left."""
+        residual, no_turn = partial(self._misfit, spec), np.zeros(len(self._leds))
+        low, high = np.array([*np.log(list(BOUNDS.values())), *[(-MOST_TURN_RAD, MOST_TURN_RAD)] * len(self._leds)]).T
+        starts = [np.append(np.log([*start, 1.0]), no_turn) for start in product(START_SIZES_MM, START_RESTS, START_CORES_MM)]
+        first = min(starts, key=lambda values: float(np.abs(residual(values)).sum()))
+        found = fit_bounded(residual, first, low, high)
+        azimuth_deg = np.array(spec.leds.azimuth_deg)
+        azimuth_deg[self._leds] = np.degrees(self._azimuth_rad + found[4:])
+        fitted = with_changes(spec, leds=self._shape(found) | {"azimuth_deg": tuple((azimuth_deg % 360).tolist())})
+        return fitted, float((residual(found) ** 2).sum())
+
+    def _shape(self, values: np.ndarray) -> dict[str, float]:
+        """Fields of ``[leds]`` for the fit's first four values."""
+        size_mm, rest, core_mm, off = np.exp(values[:4]).tolist()
+        return {"radius_mm": self._radius_mm * off, "z_mm": self._z_mm, "size_mm": size_mm, "core_share": 1 - rest, "core_mm": core_mm}
+
+    def _misfit(self, spec: SensorSpec, values: np.ndarray) -> np.ndarray:
+        """Differences in gray levels of modelled and real reflections in all squares. Each LED is modelled alone."""
+        leds, misses, shape = spec.leds, [], self._shape(values) | {"off": ()}
+        for n, k in enumerate(self._leds):
+            azimuth_deg = np.degrees(self._azimuth_rad[n] + values[4 + n])
+            one = shape | {"azimuth_deg": (azimuth_deg,), "balance": (leds.balance[k],) if leds.balance else ()}
+            light = reflections(spec.view, leds.alter(**one), spec.housing, self._rays[n]).mean(axis=(2, 3))
+            light = blurred(light + self._background[n], spec.response.blur_sigma_px)
+            misses.append(level_misfit(light, self._levels[n], spec.response)[self._used[n]].ravel())
+        return np.concatenate(misses)
 
 
 def _heart_px(still: Still, disc: Disc, azimuth_deg: float) -> np.ndarray | None:
@@ -207,22 +176,3 @@ def _heart_px(still: Still, disc: Disc, azimuth_deg: float) -> np.ndarray | None
         return None
     bright = sector & (np.hypot(x - column, y - row) < HEART_PX) & (still.gray > 0.5 * (around + still.gray[row, column]))
     return np.array([x[bright].mean(), y[bright].mean()])
-
-
-def _led_shape(seen: _Reflections, values: np.ndarray) -> dict[str, float]:
-    """Fields of ``[leds]`` for the fit's first four values."""
-    size_mm, rest, core_mm, off = np.exp(values[:4]).tolist()
-    return {"radius_mm": seen.radius_mm * off, "z_mm": seen.z_mm, "size_mm": size_mm, "core_share": 1 - rest, "core_mm": core_mm}
-
-
-def _reflection_misfit(spec: SensorSpec, seen: _Reflections, values: np.ndarray) -> np.ndarray:
-    """Differences in gray levels of modelled and real reflections in all squares. Each LED is modelled alone."""
-    leds, misses = spec.leds, []
-    shape = _led_shape(seen, values) | {"off": ()}
-    for n, k in enumerate(seen.leds):
-        azimuth_deg = np.degrees(seen.azimuth_rad[n] + values[4 + n])
-        one = shape | {"azimuth_deg": (azimuth_deg,), "balance": (leds.balance[k],) if leds.balance else ()}
-        light = reflections(spec.view, leds.alter(**one), spec.housing, seen.rays[n]).mean(axis=(2, 3))
-        light = blurred(light + seen.background[n], spec.response.blur_sigma_px)
-        misses.append(level_misfit(light, seen.levels[n], spec.response)[seen.used[n]].ravel())
-    return np.concatenate(misses)

@@ -5,16 +5,13 @@ Only the product of LED power, exposure and reflectance can be measured. Therefo
 ``twin.calibration.light.caps`` fits their individual reflectance afterwards.
 """
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
-from scenes.body import GelSpec
-from scenes.sensor import BlobSpec, ResponseSpec, SensorSpec
+from scenes.sensor import SensorSpec
 from twin.camera.capture import blurred
 from twin.evaluation.pictures.aligned import SATURATED, Aligned, levels_slope, require_cameras_own, to_levels, to_light, with_changes
-from twin.evaluation.pictures.spots import clear_of_pins
+from twin.evaluation.pictures.statistics import clear_of_pins
 from twin.geometry.pins import usual_spacing
 from twin.optics.light_model import Knobs, LightModel
 from twin.optics.render import Renderer
@@ -44,31 +41,9 @@ MOST_HAZE = 0.5
 """Largest haze that is allowed."""
 
 
-@dataclass(frozen=True)
-class Samples:
-    """Sampled places in one frame.
-
-    Attributes
-    ----------
-    pixels : (n, 2) int
-        x and y of each place.
-    levels : (n, channels) float
-        Gray levels.
-    veil : (n, channels) float
-        Light of the blurred frame, which the haze adds.
-    caps : (n,) bool
-        Whether the place is on a cap; otherwise it is on bare skin.
-    """
-
-    pixels: np.ndarray
-    levels: np.ndarray
-    veil: np.ndarray
-    caps: np.ndarray
-
-
 def sample_frame(
-    frame: Aligned, around: tuple[np.ndarray, np.ndarray], response: ResponseSpec, gel: GelSpec, blob: BlobSpec, rng: np.random.Generator
-) -> Samples:
+    frame: Aligned, around: tuple[np.ndarray, np.ndarray], spec: SensorSpec, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Sample the caps' middles and bare skin of a frame. Each sample is the mean of 3 x 3 px.
 
     The veil is the light that haze adds: the frame's own light, blurred. Where the static layer covers the gel, the frame is often
@@ -79,19 +54,25 @@ def sample_frame(
     frame : Aligned
     around : (H, W[, 3]) float, (H, W) float
         The static layer's light, and its transmittance for the gel's light.
-    response : ResponseSpec
-    gel : GelSpec
-        Gives the width of the haze.
-    blob : BlobSpec
-        Gives the mask.
+    spec : SensorSpec
     rng : numpy.random.Generator
         Generator that chooses the pixels of bare skin.
+
+    Returns
+    -------
+    pixels : (n, 2) int
+        x and y of each place.
+    levels : (n, channels) float
+        Gray levels.
+    veil : (n, channels) float
+        Light of the blurred frame, which the haze adds.
+    caps : (n,) bool
+        Whether the place is on a cap; otherwise it is on bare skin.
     """
-    image = frame.image if frame.image.ndim == 3 else frame.image[..., None]
+    image, (outside, through), blob = np.atleast_3d(frame.image), around, spec.pipeline.raw
     mean = cv2.blur(image.astype(np.float32), (3, 3)).reshape(image.shape)
-    outside, through = around
-    light = np.where(through[..., None] > 0, to_light(image, response), outside.reshape(image.shape)).astype(np.float32)
-    veil = blurred(light, gel.haze_sigma_px).reshape(image.shape)
+    light = np.where(through[..., None] > 0, to_light(image, spec.response), outside.reshape(image.shape)).astype(np.float32)
+    veil = blurred(light, spec.gel.haze_sigma_px).reshape(image.shape)
     caps = np.rint(frame.pins_px[np.isfinite(frame.pins_px).all(axis=1)]).astype(int)
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     bare = np.hypot(x - blob.mask_center_px[0], y - blob.mask_center_px[1]) < DISC_SHARE * blob.mask_radius_px
@@ -100,7 +81,7 @@ def sample_frame(
     chosen = rng.permutation(len(rows))[:SKIN_SAMPLES]
     pixels = np.concatenate([caps, np.column_stack([columns[chosen], rows[chosen]])])
     at = pixels[:, 1], pixels[:, 0]
-    return Samples(pixels, mean[at], veil[at], np.arange(len(pixels)) < len(caps))
+    return pixels, mean[at], veil[at], np.arange(len(pixels)) < len(caps)
 
 
 def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress: Step) -> SensorSpec:
@@ -121,15 +102,13 @@ def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress: Step) -> S
     """
     for frame in frames:
         require_cameras_own(frame.image, frame.name, spec.camera)
-    rng = np.random.default_rng(0)
-    renderer = Renderer(spec)
-    samples = [sample_frame(frame, renderer.static, spec.response, spec.gel, spec.pipeline.raw, rng) for frame in frames]
-    width = spec.camera.width_px
+    rng, renderer, width = np.random.default_rng(0), Renderer(spec), spec.camera.width_px
+    samples = [sample_frame(frame, renderer.static, spec, rng) for frame in frames]
     models = [
-        LightModel(renderer, f.state, s.pixels[:, 1] * width + s.pixels[:, 0], seed)
-        for seed, (f, s) in enumerate(zip(frames, samples, strict=True))
+        LightModel(renderer, frame.state, pixels[:, 1] * width + pixels[:, 0], seed)
+        for seed, (frame, (pixels, *_)) in enumerate(zip(frames, samples, strict=True))
     ]
-    levels, veil, caps = (np.concatenate([getattr(s, name) for s in samples]) for name in ("levels", "veil", "caps"))
+    _, levels, veil, caps = (np.concatenate(each) for each in zip(*samples, strict=True))
     useful = np.all(levels < SATURATED, axis=1)
     layout = _Layout(models[0].led_count, levels.shape[1])
     x = layout.start(models, to_light(levels[caps & useful], spec.response), caps & useful, spec.gel.haze)

@@ -7,13 +7,12 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares, minimize_scalar
 
-from scenes.sensor import CameraSpec, LensSpec, ResponseSpec, SensorSpec
+from scenes.sensor import LensSpec, ResponseSpec, SensorSpec
 from twin.calibration.light.photometry import MOST_HAZE
 from twin.camera.capture import expose, hazed, luma_weights, stream_of
 from twin.camera.projection import lens_disc, project
 from twin.evaluation.pictures.aligned import SATURATED, Aligned, with_changes
-from twin.evaluation.pictures.spectra import bin_of, equal_count_edges, noise_sd
-from twin.evaluation.pictures.statistics import bare_skin
+from twin.evaluation.pictures.statistics import bare_skin, bin_of, equal_count_edges, noise_sd
 from twin.frames.forms import gray_levels
 from twin.pins.finding.caps import measure_caps
 
@@ -89,7 +88,7 @@ def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray
         return misfit(with_values(values))
 
     low, high, unit = np.array([bounds[name] for name in names]).T
-    start = np.clip([_value(spec.response, spec.camera, name) for name in names], low + 1e-6, high - 1e-6)
+    start = np.clip([_value(spec, name) for name in names], low + 1e-6, high - 1e-6)
     start[names.index("sharpening")] = max(spec.response.sharpening, LEAST_SHARPENING)
 
     def slopes(values: np.ndarray) -> np.ndarray:
@@ -150,21 +149,21 @@ def chroma_columns(images: list[np.ndarray]) -> int:
     return 2 if steps[0] < SAME_CHROMA * steps[1] else 1
 
 
-def _value(response: ResponseSpec, camera: CameraSpec, name: str) -> float:
+def _value(spec: SensorSpec, name: str) -> float:
     """Value of a fitted quantity, by its name in the tables above; ``.0`` and ``.1`` are x and y of a shift."""
-    field, _, index = name.partition(".")
-    value = getattr(response if field in BOUNDS | CHROMA else camera, field)
-    return value[int(index)] if index else value
+    key, _, axis = name.partition(".")
+    value = getattr(spec.response if key in BOUNDS | CHROMA else spec.camera, key)
+    return value[int(axis)] if axis else value
 
 
 def _with_values(spec: SensorSpec, values: dict[str, float]) -> SensorSpec:
     """The specification with values of the fitted quantities."""
-    response = {name: value for name, value in values.items() if name in BOUNDS | CHROMA}
-    camera: dict[str, Any] = {name: value for name, value in values.items() if name in FRINGES}
-    for name in values.keys() & SHIFTS.keys():
-        field = name.partition(".")[0]
-        camera[field] = (values[f"{field}.0"], values[f"{field}.1"])
-    return with_changes(spec, response=response, camera=camera)
+    changes: dict[str, dict[str, Any]] = {"response": {}, "camera": {}}
+    for name, value in values.items():
+        key, _, axis = name.partition(".")
+        of = changes["response" if key in BOUNDS | CHROMA else "camera"]
+        of[key] = (*of.get(key, ()), value) if axis else value
+    return with_changes(spec, **changes)
 
 
 def sharpness(spec: SensorSpec, frames: list[Aligned], rendered: Sequence[np.ndarray], bins: int = 5) -> Sharpness:

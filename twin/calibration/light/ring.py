@@ -1,22 +1,21 @@
-"""Fit of the housing's opening and the bright ring around it to the still picture.
+"""Fit of the housing's opening and the bright ring around it to the still picture, and of the rim's light to all frames.
 
 First the edge of the disc through which the gel is seen is found, because it is the edge of the opening. Then the light of ring and wall
-outside of it is fitted.
+outside of it is fitted. At the end, the light at the edge that no formula describes (glue, burrs, glare) is measured as a table by azimuth
+and radius.
 """
-
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from scenes.body import GelSpec
-from scenes.sensor import HousingSpec, SensorSpec
+from scenes.sensor import CameraSpec, HousingSpec, RimSpec, SensorSpec
 from twin.calibration.light.still import ROBUST_LEVELS, Still, fit_bounded, level_misfit, sample_field
-from twin.camera.capture import hazed, vignetted
-from twin.camera.projection import lens_disc, round_disc
+from twin.camera.capture import expose, hazed, vignetted
+from twin.camera.projection import lens_disc, round_disc, sensor_to_camera
 from twin.errors import FrameError
-from twin.evaluation.pictures.aligned import to_light, with_changes
-from twin.optics.static_layer import housing_light
+from twin.evaluation.pictures.aligned import SATURATED, Aligned, to_light, with_changes
+from twin.optics.glass import ray_table
+from twin.optics.static_layer import RIM_UNIT, housing_light, rim_places, static_layer
 
 RAYS = 720
 """Number of rays from the disc's centre along which the edge is searched."""
@@ -66,6 +65,13 @@ LEAST_START = 1e-3
 """Least starting value, because its logarithm is taken."""
 NO_STEP = -1e-6
 """Lower bound of the logarithm of ``wall_fraction`` where there is no step: the wall is as bright as the lip."""
+INSIDE_MM, OUTSIDE_MM = 1.75, 0.4
+"""Distances from the edge of the housing's opening, inwards and outwards, that the rim's table covers. No pin comes so near to the edge."""
+AZIMUTHS, RADII = 240, 32
+"""Number of azimuths and of radii in the table. There are many radii, because the light changes steeply at the edge."""
+ROUNDS, GAIN = 3, 0.9
+"""Rounds of correction of the table, and share of the missing light that each round adds. Several rounds are needed, because blur and
+sharpening act after the correction."""
 
 
 class NoRing(FrameError):
@@ -129,46 +135,26 @@ def _circle_through(points: np.ndarray, start: list[float], scale: float) -> tup
     return x, y, radius
 
 
-@dataclass(frozen=True)
-class _Wall:
-    """The thinned-out pixels of the still picture that are compared, and the constants of their modelled light.
-
-    Attributes
-    ----------
-    at_mm : (h, w, 2) float
-        Place at which each pixel's ray meets the housing's plane.
-    wall, compared : (h, w) bool
-        Pixels that show the wall; pixels whose misfit is fitted.
-    levels, inside : (h, w, 3) float
-        Gray levels; their light, which is not modelled inside the disc.
-    loss : (h, w, 1) float
-        Factor of the vignetting.
-    haze : GelSpec
-        The gel, with the haze's width in thinned-out pixels.
-    """
-
-    at_mm: np.ndarray
-    wall: np.ndarray
-    compared: np.ndarray
-    levels: np.ndarray
-    inside: np.ndarray
-    loss: np.ndarray
-    haze: GelSpec
-
-
 def fit_ring(spec: SensorSpec, still: Still) -> SensorSpec:
     """The specification with the light of ring and wall outside the disc.
 
     Only the product of ``housing.albedo`` and light can be measured, so the largest channel of the albedo is not changed.
     """
-    seen, start, names = _thin_out(spec, still), _start_values(spec.housing), list(BOUNDS)
-    low, high = np.log(np.array(list(BOUNDS.values())).T)
+    ring, few = spec.housing, (slice(None, None, EVERY),) * 2
+    at_mm = still.tangents[few] * (ring.z_mm + spec.camera.distance_mm)  # where each pixel's ray meets the housing's plane
+    beyond_mm = np.linalg.norm(at_mm - ring.center_mm, axis=-1) - ring.aperture_radius_mm
+    wall = beyond_mm >= 0
+    compared = beyond_mm > RIM_PX * ring.aperture_radius_mm / lens_disc(spec.view, ring).radius_px
+    levels, inside = still.image[few], to_light(still.image, spec.response)[few].astype(np.float32)  # the disc's light is not modelled
+    loss = vignetted(np.ones((*still.gray.shape, 1), np.float32), spec.camera)[few]
+    gel = spec.gel.alter(haze_sigma_px=spec.gel.haze_sigma_px / EVERY)  # in thinned-out pixels
+    start, (low, high) = _start_values(ring), np.log(np.array(list(BOUNDS.values())).T)
 
     def residual(values: np.ndarray) -> np.ndarray:
-        trial = spec.alter(housing=_housing_values(spec.housing, values))
-        light = seen.inside.copy()
-        light[seen.wall] = housing_light(trial.leds, trial.housing, seen.at_mm[seen.wall])
-        return level_misfit(hazed(light, seen.haze) * seen.loss, seen.levels, spec.response)[seen.compared].ravel()
+        trial = spec.alter(housing=_housing_values(ring, values))
+        light = inside.copy()
+        light[wall] = housing_light(trial.leds, trial.housing, at_mm[wall])
+        return level_misfit(hazed(light, gel) * loss, levels, spec.response)[compared].ravel()
 
     def fitted(changed: dict[str, float], least: np.ndarray, most_steps: int) -> tuple[float, np.ndarray]:
         """Misfit and values from one start."""
@@ -176,32 +162,13 @@ def fit_ring(spec: SensorSpec, still: Still) -> SensorSpec:
         found = fit_bounded(residual, first, least, high, most_steps=most_steps)
         return float(np.sum(np.log1p((residual(found) / ROBUST_LEVELS) ** 2))), found
 
-    without_step = low.copy()
-    without_step[names.index("wall_fraction")] = NO_STEP
+    without_step = np.where(np.array(list(BOUNDS)) == "wall_fraction", NO_STEP, low)
     smooth_misfit, smooth = fitted({"wall_fraction": 1.0}, without_step, SMOOTH_STEPS)
     tried = [fitted({"lip_width_mm": width_mm}, low, TRIAL_STEPS) for width_mm in START_LIPS_MM]
     step_misfit, stepped = min(tried, key=lambda fit: fit[0])
     if step_misfit > (1 - LEAST_STEP_GAIN) * smooth_misfit:
-        no_lip = {"lip_width_mm": spec.housing.lip_width_mm, "wall_fraction": 1.0}
-        return with_changes(spec, housing=_housing_values(spec.housing, smooth) | no_lip)
-    return with_changes(spec, housing=_housing_values(spec.housing, fit_bounded(residual, stepped, low, high)))
-
-
-def _thin_out(spec: SensorSpec, still: Still) -> _Wall:
-    """Thin out the still picture, and compute the constants of the model."""
-    ring, few = spec.housing, (slice(None, None, EVERY),) * 2
-    at_mm = still.tangents[few] * (ring.z_mm + spec.camera.distance_mm)
-    margin_mm = RIM_PX * ring.aperture_radius_mm / lens_disc(spec.view, spec.housing).radius_px
-    beyond_mm = np.linalg.norm(at_mm - ring.center_mm, axis=-1) - ring.aperture_radius_mm
-    return _Wall(
-        at_mm=at_mm,
-        wall=beyond_mm >= 0,
-        compared=beyond_mm > margin_mm,
-        levels=still.image[few],
-        inside=to_light(still.image, spec.response)[few].astype(np.float32),
-        loss=vignetted(np.ones((*still.gray.shape, 1), np.float32), spec.camera)[few],
-        haze=spec.gel.alter(haze_sigma_px=spec.gel.haze_sigma_px / EVERY),
-    )
+        return with_changes(spec, housing=_housing_values(ring, smooth) | {"lip_width_mm": ring.lip_width_mm, "wall_fraction": 1.0})
+    return with_changes(spec, housing=_housing_values(ring, fit_bounded(residual, stepped, low, high)))
 
 
 def _start_values(ring: HousingSpec) -> dict[str, float]:
@@ -217,3 +184,63 @@ def _housing_values(ring: HousingSpec, values: np.ndarray) -> dict[str, float | 
     colour = np.array([found.pop("red"), 1.0, found.pop("blue")])
     found["glow_radius_mm"] *= ring.aperture_radius_mm
     return {**found, "albedo": tuple((colour * max(ring.albedo) / colour.max()).tolist())}
+
+
+def fit_rim(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray]) -> SensorSpec:
+    """The specification with ``housing.rim``: the light of real frames minus that of rendered ones, mean over the frames.
+
+    A saturated pixel never lowers the light.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+        A specification in which everything else was fitted.
+    frames : list of Aligned
+    light : list of (H, W, 3) or (H, W) float
+        Rendered light of each frame's state.
+    """
+    ring = spec.housing
+    inner, outer = ring.aperture_radius_mm - INSIDE_MM, ring.aperture_radius_mm + OUTSIDE_MM
+    cell, weight, pixels = _cells(spec.camera, ring, inner, outer)
+    window = (0, 0, spec.camera.width_px, spec.camera.height_px)
+    before = static_layer(spec, window)[0]
+    table = np.zeros((AZIMUTHS, RADII, 3))
+    if ring.rim is not None and np.shape(ring.rim.light) == table.shape:
+        table += np.array(ring.rim.light) / RIM_UNIT
+    total = np.maximum(np.bincount(cell.ravel(), weight.ravel(), minlength=AZIMUTHS * RADII), 1e-6)
+    for _ in range(ROUNDS):
+        spec = _with_rim(spec, inner, outer, table)
+        more = static_layer(spec, window)[0] - before
+        more = more if spec.camera.channels == "color" else more.mean(axis=2)
+        missing = np.mean([_missing(spec, frame, np.maximum(lit + more, 0)) for frame, lit in zip(frames, light, strict=True)], axis=0)
+        for k, flat in enumerate(np.broadcast_to(np.atleast_3d(missing), (*missing.shape[:2], 3)).reshape(-1, 3)[pixels].T):
+            sums = np.bincount(cell.ravel(), (weight * flat[:, None]).ravel(), minlength=AZIMUTHS * RADII)
+            table[..., k] += GAIN * (sums / total).reshape(AZIMUTHS, RADII)
+    return _with_rim(spec, inner, outer, table)
+
+
+def _with_rim(spec: SensorSpec, inner_mm: float, outer_mm: float, table: np.ndarray) -> SensorSpec:
+    """The specification with a table (A, R, 3) of linear light as its rim."""
+    rim = RimSpec(inner_mm=inner_mm, outer_mm=outer_mm, light=np.rint(RIM_UNIT * table).astype(int).tolist())
+    return with_changes(spec, housing={"rim": rim.model_dump()})
+
+
+def _missing(spec: SensorSpec, frame: Aligned, light: np.ndarray) -> np.ndarray:
+    """Light of a real frame minus that of a render, in the renderer's unit."""
+    shown = expose(light, spec.capture)
+    lacking = to_light(frame.image, spec.response) - to_light(shown, spec.response)
+    return np.where((frame.image >= SATURATED) & (shown >= SATURATED), 0.0, lacking)
+
+
+def _cells(camera: CameraSpec, ring: HousingSpec, inner_mm: float, outer_mm: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The four table entries (n, 4) around each pixel of the band, their bilinear weights (n, 4), and the pixels' flat indices (n,)."""
+    corners = ray_table(camera, (0, 0, camera.width_px, camera.height_px)) @ sensor_to_camera(camera)[:3, :3]
+    rays = ((corners[:-1, :-1] + corners[1:, 1:]) / 2).reshape(-1, 3)
+    turn, along = rim_places(ring, inner_mm, outer_mm, (AZIMUTHS, RADII), rays[:, :2] / rays[:, 2:] * (ring.z_mm + camera.distance_mm))
+    pixels = np.flatnonzero((along > 0) & (along < RADII - 1))
+    turn, along = turn[pixels], along[pixels]
+    row, column = np.floor(turn).astype(int), np.minimum(np.floor(along).astype(int), RADII - 2)
+    a, b = turn - row, along - column
+    cell = np.stack([(row + j) % AZIMUTHS * RADII + column + k for j in (0, 1) for k in (0, 1)], axis=1)
+    weight = np.stack([(a if j else 1 - a) * (b if k else 1 - b) for j in (0, 1) for k in (0, 1)], axis=1)
+    return cell, weight, pixels

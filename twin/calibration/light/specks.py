@@ -1,7 +1,5 @@
 """Fit of specks on the window (bubbles, grains, dust): bright spots that do not move while pins pass behind them."""
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
@@ -10,7 +8,7 @@ from twin.calibration.light.still import Still, fit_bounded, level_misfit, sampl
 from twin.camera.capture import blurred
 from twin.camera.projection import lens_disc
 from twin.evaluation.pictures.aligned import to_light, with_changes
-from twin.evaluation.pictures.spots import clear_of_pins
+from twin.evaluation.pictures.statistics import clear_of_pins
 from twin.frames.forms import gray_levels
 from twin.geometry.pins import usual_spacing
 from twin.optics.static_layer import reflections
@@ -50,9 +48,8 @@ MOST_SPECKS = 60
 PLAIN_OPACITY = 0.5
 
 
-@dataclass(frozen=True)
 class _WindowView:
-    """The window, from the frames in which no pin is near a place.
+    """The window in frames (M, H, W, 3) uint8 with pins at (M, N, 2) px, from the frames in which no pin is near a place.
 
     Attributes
     ----------
@@ -61,63 +58,53 @@ class _WindowView:
     pins_px : (M, N, 2) float
     spacing_px : float
         Spacing of the pins in the first frame.
+    place_mm : (H, W, 2) float
+        Place at which each pixel's ray passes from the window into the gel.
     usable : (H, W) bool
         Pixels in the disc that are away from the LEDs' reflections, and clear of pins in enough frames.
     behind : (H, W) float32
         Median gray level over the frames in which a pixel is clear; 0 if it is not usable.
     ground : (H, W) float32
         ``behind`` without small bright spots.
-    place_mm : (H, W, 2) float
-        Place at which each pixel's ray passes from the window into the gel.
+    rise : (H, W) float32
+        Gray levels above the ground; 0 if not usable.
     """
 
-    gray: np.ndarray
-    pins_px: np.ndarray
-    spacing_px: float
-    usable: np.ndarray
-    behind: np.ndarray
-    ground: np.ndarray
-    place_mm: np.ndarray
-
-    @property
-    def rise(self) -> np.ndarray:
-        """(H, W) gray levels above the ground; 0 for pixels that are not usable."""
-        return np.where(self.usable, self.behind - self.ground, 0)
+    def __init__(self, spec: SensorSpec, still: Still, images: np.ndarray, pins_px: np.ndarray) -> None:
+        self.gray, self.pins_px = np.array([gray_levels(image) for image in images]), pins_px
+        self.spacing_px = usual_spacing(pins_px[0])
+        shape, disc, response, lens = self.gray.shape[1:], lens_disc(spec.view, spec.housing), spec.response, spec.lens
+        clear = np.array([clear_of_pins(shape, pins, CLEAR_SHARE * self.spacing_px) for pins in pins_px])
+        u2 = np.sum(still.tangents**2, axis=-1, keepdims=True)
+        in_window = 1 / np.sqrt(lens.refractive_index**2 + (lens.refractive_index**2 - 1) * u2)  # tangent in the window / tangent in air
+        self.place_mm = still.tangents * (lens.back_mm + spec.camera.distance_mm + lens.thickness_mm * in_window)
+        shine = reflections(spec.view, spec.leds, spec.housing, still.tangents).max(axis=2) * response.exposure
+        least_shine = to_light(np.array(response.black_level + LEAST_RISE_LEVELS), response)
+        grown = cv2.dilate((shine > least_shine).astype(np.uint8), np.ones((REFLECTION_MARGIN_PX, REFLECTION_MARGIN_PX)))
+        y, x = np.mgrid[: shape[0], : shape[1]]
+        in_disc = disc.distance_px(np.stack([x, y], axis=-1)) < disc.radius_px - RIM_PX
+        self.usable = in_disc & ~(grown > 0) & (clear.sum(axis=0) >= LEAST_FRAMES)
+        self.behind = np.zeros(shape, np.float32)
+        seen = np.where(clear[:, self.usable], self.gray[:, self.usable].astype(np.float32), np.nan)
+        self.behind[self.usable] = np.nanmedian(seen, axis=0)
+        self.ground = _without_spots(self.behind, self.usable)
+        self.rise = np.where(self.usable, self.behind - self.ground, 0)
 
 
 def fit_specks(spec: SensorSpec, still: Still, images: np.ndarray, pins_px: np.ndarray) -> SensorSpec:
     """The specification with the specks in frames (M, H, W, 3) uint8, whose pins are at (M, N, 2) px."""
-    view = _window_view(spec, still, images, pins_px)
-    rise, centers = view.rise, _bright_spots(view)
-    known = np.array([_measured_opacity(view, center, spec.response) for center in centers])
-    brightness = np.array([rise[row, column] for column, row in np.rint(np.array(centers).reshape(-1, 2)).astype(int)])
+    view = _WindowView(spec, still, images, pins_px)
+    centers = _bright_spots(view)
+    opacities = np.array([_measured_opacity(view, center, spec.response) for center in centers])
+    brightness = np.array([view.rise[row, column] for column, row in np.rint(np.array(centers).reshape(-1, 2)).astype(int)])
+    if len(known := np.flatnonzero(np.isfinite(opacities))):  # each has that of the known one whose brightness is most similar
+        opacities = opacities[known[np.argmin(np.abs(brightness[known] - brightness[:, None]), axis=1)]]
     specks: list[SpeckSpec] = []
-    for k, center in enumerate(centers):
-        opacity = _opacity_of_the_most_alike(k, known, brightness)
+    for center, opacity in zip(centers, np.nan_to_num(opacities, nan=PLAIN_OPACITY).tolist(), strict=True):
         speck = _fitted_speck(view, center, opacity, spec.response)
         if speck and not any(np.hypot(speck.x_mm - s.x_mm, speck.y_mm - s.y_mm) < s.radius_mm for s in specks):
             specks.append(speck)
     return with_changes(spec, appearance={"specks": [speck.model_dump() for speck in specks]})
-
-
-def _window_view(spec: SensorSpec, still: Still, images: np.ndarray, pins_px: np.ndarray) -> _WindowView:
-    """Compute the window's appearance in the frames, and the places of its pixels."""
-    gray = np.array([gray_levels(image) for image in images])
-    spacing = usual_spacing(pins_px[0])
-    clear = np.array([clear_of_pins(gray.shape[1:], pins, CLEAR_SHARE * spacing) for pins in pins_px])
-    y, x = np.mgrid[: gray.shape[1], : gray.shape[2]]
-    disc, response, lens = lens_disc(spec.view, spec.housing), spec.response, spec.lens
-    u2 = np.sum(still.tangents**2, axis=-1, keepdims=True)
-    in_window = 1 / np.sqrt(lens.refractive_index**2 + (lens.refractive_index**2 - 1) * u2)  # tangent in the window / tangent in air
-    place_mm = still.tangents * (lens.back_mm + spec.camera.distance_mm + lens.thickness_mm * in_window)
-    shine = reflections(spec.view, spec.leds, spec.housing, still.tangents).max(axis=2) * response.exposure
-    least_shine = to_light(np.array(response.black_level + LEAST_RISE_LEVELS), response)
-    grown = cv2.dilate((shine > least_shine).astype(np.uint8), np.ones((REFLECTION_MARGIN_PX, REFLECTION_MARGIN_PX)))
-    in_disc = disc.distance_px(np.stack([x, y], axis=-1)) < disc.radius_px - RIM_PX
-    usable = in_disc & ~(grown > 0) & (clear.sum(axis=0) >= LEAST_FRAMES)
-    behind = np.zeros(gray.shape[1:], np.float32)
-    behind[usable] = np.nanmedian(np.where(clear[:, usable], gray[:, usable].astype(np.float32), np.nan), axis=0)
-    return _WindowView(gray, pins_px, spacing, usable, behind, _without_spots(behind, usable), place_mm)
 
 
 def _without_spots(behind: np.ndarray, usable: np.ndarray) -> np.ndarray:
@@ -129,8 +116,7 @@ def _without_spots(behind: np.ndarray, usable: np.ndarray) -> np.ndarray:
 
 def _bright_spots(view: _WindowView) -> list[np.ndarray]:
     """Middles (2,) px of round bright spots; the most significant comes first."""
-    rise = view.rise
-    count, labels, stats, centers = cv2.connectedComponentsWithStats((rise > LEAST_RISE_LEVELS).astype(np.uint8), connectivity=8)
+    count, labels, stats, centers = cv2.connectedComponentsWithStats((view.rise > LEAST_RISE_LEVELS).astype(np.uint8), connectivity=8)
     found = []
     for k in range(1, count):
         area, across = stats[k, cv2.CC_STAT_AREA], max(stats[k, cv2.CC_STAT_WIDTH], stats[k, cv2.CC_STAT_HEIGHT])
@@ -138,7 +124,7 @@ def _bright_spots(view: _WindowView) -> list[np.ndarray]:
             spot = labels == k
             border = (cv2.dilate(spot.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & (labels == 0)
             if view.usable[border].mean() > LEAST_CLEAR_BORDER:
-                found.append((float(rise[spot].sum()), centers[k]))
+                found.append((float(view.rise[spot].sum()), centers[k]))
     return [center for _, center in sorted(found, key=lambda each: -each[0])[:MOST_SPECKS]]
 
 
@@ -166,14 +152,6 @@ def _neighbours(pins_px: np.ndarray, pin: int) -> np.ndarray:
     return nearest[np.isfinite(pins_px[nearest, 0])]
 
 
-def _opacity_of_the_most_alike(k: int, known: np.ndarray, brightness: np.ndarray) -> float:
-    """Opacity of the k-th speck: its own if it is ``known`` (n,), else that of the speck with the most similar brightness."""
-    measured = np.flatnonzero(np.isfinite(known))
-    if not len(measured):
-        return PLAIN_OPACITY
-    return float(known[measured[np.argmin(np.abs(brightness[measured] - brightness[k]))]])
-
-
 def _fitted_speck(view: _WindowView, center_px: np.ndarray, opacity: float, response: ResponseSpec) -> SpeckSpec | None:
     """A speck with place, radius and light fitted to the gray levels around it; None if a soft disc does not explain them."""
     column, row = np.rint(center_px).astype(int)
@@ -199,4 +177,4 @@ def _fitted_speck(view: _WindowView, center_px: np.ndarray, opacity: float, resp
         return None
     radius_mm, light = np.exp(found[2:]).tolist()
     x_mm, y_mm = (first_mm + found[:2]).tolist()
-    return SpeckSpec(x_mm=x_mm, y_mm=y_mm, radius_mm=radius_mm, opacity=float(opacity), light=light)
+    return SpeckSpec(x_mm=x_mm, y_mm=y_mm, radius_mm=radius_mm, opacity=opacity, light=light)

@@ -5,6 +5,7 @@ haze and everything on the gel's side of the window are not changed.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -48,13 +49,10 @@ def fit_surroundings(spec: SensorSpec, images: np.ndarray, pins_px: np.ndarray, 
     images, pins_px = images[chosen], pins_px[chosen]
     images = np.repeat(images[..., None], 3, axis=3) if images.ndim == 3 else images
     still = median_still(spec, images)
-
-    def specks(found: SensorSpec, still: Still) -> SensorSpec:
-        return fit_specks(found, still, images, pins_px)
-
-    stages: tuple[Callable[[SensorSpec, Still], SensorSpec], ...] = (fit_disc_edge, turn_leds, fit_reflections, fit_ring, specks)
-    for stage in report_each(stages, progress):
-        spec = stage(spec, still)
+    specks = partial(fit_specks, images=images, pins_px=pins_px)
+    fits: tuple[Callable[[SensorSpec, Still], SensorSpec], ...] = (fit_disc_edge, turn_leds, fit_reflections, fit_ring, specks)
+    for fit in report_each(fits, progress):
+        spec = fit(spec, still)
     return spec
 
 

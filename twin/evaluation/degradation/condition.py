@@ -7,7 +7,7 @@ called, so that nothing changes, bit for bit.
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -70,21 +70,9 @@ class PictureView:
         return (x - np.float32(self.center_px[0])) / self.radius_px, (y - np.float32(self.center_px[1])) / self.radius_px
 
 
-SpecChange = Callable[[SensorSpec, float, np.random.Generator], SensorSpec]
 ImageChange = Callable[[np.ndarray, float, PictureView, np.random.Generator], np.ndarray]
-PointMove = Callable[[np.ndarray, float, PictureView], np.ndarray]
-CapsGone = Callable[[float, PictureView, np.random.Generator], np.ndarray]
-SettingChange = Callable[[DetectorSpec, float], DetectorSpec]
-
-
 S = TypeVar("S", bound=Section)
 T = TypeVar("T")
-
-
-class SectionChange(Protocol[S]):
-    """Degrades one section of a specification: ``change(section, value, rng)``."""
-
-    def __call__(self, section: S, value: float, rng: np.random.Generator, /) -> S: ...
 
 
 @dataclass(frozen=True)
@@ -92,7 +80,7 @@ class OnSection(Generic[S]):
     """A change of one section, as a change of the specification. It is a class, because closures can't be sent between processes."""
 
     section: str
-    change: SectionChange[S]
+    change: Callable[[S, float, np.random.Generator], S]
 
     def __call__(self, spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
         return spec.alter(**{self.section: self.change(getattr(spec, self.section), value, rng)})
@@ -135,13 +123,13 @@ class Condition:
     unit: str
     severe: float
     nominal: float = 0.0
-    spec: SpecChange | None = field(default=None, repr=False)
+    spec: Callable[[SensorSpec, float, np.random.Generator], SensorSpec] | None = field(default=None, repr=False)
     solves: bool = False
     light: ImageChange | None = field(default=None, repr=False)
     frame: ImageChange | None = field(default=None, repr=False)
-    moves: PointMove | None = field(default=None, repr=False)
-    hides: CapsGone | None = field(default=None, repr=False)
-    setting: SettingChange | None = field(default=None, repr=False)
+    moves: Callable[[np.ndarray, float, PictureView], np.ndarray] | None = field(default=None, repr=False)
+    hides: Callable[[float, PictureView, np.random.Generator], np.ndarray] | None = field(default=None, repr=False)
+    setting: Callable[[DetectorSpec, float], DetectorSpec] | None = field(default=None, repr=False)
     image_level: bool = False
 
     def value(self, severity: float) -> float:
@@ -182,6 +170,11 @@ class DegradedCase:
     def solves(self) -> bool:
         """Whether contacts must be solved again, because a condition changes the mechanics."""
         return any(c.solves for c in self.conditions)
+
+    @property
+    def in_light(self) -> bool:
+        """Whether a condition acts before the camera's response, so that it can't be applied to thresholded frames."""
+        return any(c.spec is not None or c.light is not None for c in self.conditions)
 
     @property
     def image_level(self) -> bool:

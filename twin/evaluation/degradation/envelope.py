@@ -148,11 +148,8 @@ def evaluate_sweep(plan: SweepSettings, folder: Path, *, jobs: int, progress: Ca
         rows = run_sweep(plan, folder, jobs=jobs, progress=progress)
         curves = curves_of(rows, plan.cases, pitch_px)
         envelopes = envelopes_of(curves, plan.cases)
-        further = {name: set(plan.between.get(name, ())) for name in (case.name for case in plan.cases)}
-        for envelope in envelopes:
-            if envelope.middle is not None:
-                further[envelope.case.name].add(envelope.middle)
-        if all(further[name] <= plan.between.get(name, set()) for name in further):
+        further = plan.between | {(envelope.case.name, envelope.middle) for envelope in envelopes if envelope.middle is not None}
+        if further == plan.between:
             return SweepEvaluation(plan, rows, curves, envelopes)
         plan = replace(plan, between=further)
 

@@ -8,7 +8,6 @@ from scipy.spatial import cKDTree
 
 from twin.evaluation.degradation.shots import DegradedFrame
 from twin.pins.detectors.detector import Detector, Found, reorder_to
-from twin.types import PinGraph
 
 # Largest distance between a detected position and its pin, relative to the distance of the pin's nearest neighbour. It was chosen
 # below one half, so that a detection counts for one pin at most.
@@ -71,7 +70,8 @@ def measure_frame(detector: Detector, found: Found, degraded: DegradedFrame) -> 
     right = degraded.visible[pin]
     apart = np.linalg.norm(found.claims_px[claim[right]] - truth_px[pin[right]], axis=1)
     doubtful = known & ~degraded.visible  # a hidden cap may be partly visible, so a detection there is neither right nor wrong
-    claims = len(found.claims_px) - int(doubtful[pin].sum()) - _count_beside_unknown(found.claims_px, known)
+    beside_unknown = min(len(found.claims_px) - int(known.sum()), int((~known).sum()))  # the consensus of detectors may lack some pins
+    claims = len(found.claims_px) - int(doubtful[pin].sum()) - max(0, beside_unknown)
     area, edges = _graph_errors(detector, found, degraded)
     return {
         "valid": float(found.valid),
@@ -84,15 +84,8 @@ def measure_frame(detector: Detector, found: Found, degraded: DegradedFrame) -> 
     }
 
 
-def _count_beside_unknown(claims_px: np.ndarray, known: np.ndarray) -> int:
-    """Number of detections that may be pins whose place is unknown. The consensus of detectors may lack some pins."""
-    return max(0, min(len(claims_px) - int(known.sum()), int((~known).sum())))
-
-
 def _pairs(claims_px: np.ndarray, truth_px: np.ndarray, gate_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of pins and detections, one to one within each pin's gate. The nearest are paired first."""
-    if not len(claims_px):
-        return np.zeros(0, int), np.zeros(0, int)
     known = np.flatnonzero(np.isfinite(gate_px))
     distance = np.linalg.norm(truth_px[known][:, None] - claims_px, axis=2)
     near = distance < gate_px[known][:, None]
@@ -105,12 +98,9 @@ def _pairs(claims_px: np.ndarray, truth_px: np.ndarray, gate_px: np.ndarray) -> 
 
 def _swaps(found: Found, truth_px: np.ndarray, gate_px: np.ndarray) -> float:
     """Share of the pins whose label is at another pin's place."""
-    if found.pins_px is None:
+    if found.pins_px is None or not np.isfinite(found.pins_px[:, 0]).any():
         return np.nan
-    seen = np.flatnonzero(np.isfinite(found.pins_px[:, 0]))
-    known = np.flatnonzero(np.isfinite(truth_px[:, 0]))
-    if not len(seen):
-        return np.nan
+    seen, known = (np.flatnonzero(np.isfinite(px[:, 0])) for px in (found.pins_px, truth_px))
     distance, nearest = cKDTree(truth_px[known]).query(found.pins_px[seen])
     at = known[nearest]
     return float(np.mean((distance < gate_px[at]) & (at != seen)))
@@ -120,15 +110,11 @@ def _graph_errors(detector: Detector, found: Found, degraded: DegradedFrame) -> 
     """Median relative error of the cells' areas, and share of common edges, compared with the method's own graph of the true pins."""
     if found.graph is None or not np.isfinite(degraded.caps_px).all():
         return np.nan, np.nan
-    true = detector.graph_of(degraded.caps_px)
     graph = found.graph if found.pins_px is not None else reorder_to(found.graph, found.claims_px, degraded.caps_px)
-    if true is None or graph is None:
+    true = detector.graph_of(degraded.caps_px)
+    if true is None:
         return np.nan, np.nan
     there = degraded.visible & np.isfinite(graph.area_px2) & np.isfinite(true.area_px2) & (true.area_px2 > 0)
     area = float(np.median(np.abs(graph.area_px2[there] / true.area_px2[there] - 1))) if there.any() else np.nan
-    return area, _jaccard(graph, true)
-
-
-def _jaccard(a: PinGraph, b: PinGraph) -> float:
-    one, other = ({tuple(edge) for edge in graph.edges.tolist()} for graph in (a, b))
-    return len(one & other) / max(len(one | other), 1)
+    ours, others = ({tuple(edge) for edge in of.edges.tolist()} for of in (graph, true))
+    return area, len(ours & others) / max(len(ours | others), 1)

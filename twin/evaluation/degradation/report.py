@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from twin.evaluation.degradation.condition import DegradedCase
 from twin.evaluation.degradation.envelope import NEAR, SHORT, Curve, Envelope, Share, SweepEvaluation, shares_of
 from twin.evaluation.degradation.measures import MEASURES, POSE_MEASURES
-from twin.evaluation.degradation.sweep import SweepCell, SweepSettings, cells_of
+from twin.evaluation.degradation.sweep import SweepSettings, cells_of
 from twin.pins import DetectorSpec
 from twin.report.charts import faint, muted_colour, sized_figure, write_chart
 from twin.report.page import Page, PagePicture, bad, good, link_to, sentence, strong
@@ -56,28 +56,16 @@ def write_report(
     of_first = sorted((e for e in envelopes if e.pipeline == first), key=lambda e: e.width)
     comparisons = [compare(envelopes, first, other.name) | {"nameless": other.method == "legacy"} for other in plan.detectors[1:]]
     shares = shares_of(envelopes, rendered.envelopes, first) if rendered else []
-    written = [
-        write_json(
-            out / "envelope.json",
-            {
-                "comparisons": comparisons,
-                "envelope": [_row(e) for e in envelopes],
-                "shares": [_share_row(s) for s in shares],
-                "made_by": made_by("twin.evaluation.degradation.sweep"),
-            },
-        ),
-        write_rows(out / "envelope.csv", [_row(e) for e in envelopes]),
-        write_rows(out / "curves.csv", _curve_rows(plan, evaluation.curves)),
-        write_rows(out / "frames.csv", [_flat(row) for row in evaluation.rows]),
-    ]
-    if shares:
-        written.append(write_rows(out / "real-on-rendered.csv", [_share_row(s) for s in shares]))
+    rows, margins, frames = [_row(e) for e in envelopes], [_share_row(s) for s in shares], [_flat(row) for row in evaluation.rows]
+    figures = {"comparisons": comparisons, "envelope": rows, "shares": margins, "made_by": made_by("twin.evaluation.degradation.sweep")}
+    tables = {"envelope": rows, "curves": _curve_rows(plan, evaluation.curves), "frames": frames, "real-on-rendered": margins}
+    written = [write_json(out / "envelope.json", figures), *(write_rows(out / f"{name}.csv", of) for name, of in tables.items() if of)]
     page = Page(
         f"Robustness of {plan.source.spec.name}",
         "twin robustness",
         topic="TacTip twin: robustness",
         lead=f"{plan.source.spec.description}. How far may the sensor degrade before its pins are lost? Source: {source}, "
-        f"{len(plan.source.names())} frames for each step. Every condition grows from nothing to severe while all else stays as it was.",
+        f"{len(plan.source)} frames for each step. Every condition grows from nothing to severe while all else stays as it was.",
     )
     page.notice("Noted", notes)
     _pipelines_section(page, plan, comparisons)
@@ -168,7 +156,7 @@ def _shares_section(page: Page, out: Path, plan: SweepSettings, shares: list[Sha
     page.section(
         "This sensor on the rendered envelope",
         sentence(
-            f"The same conditions on {len(plan.source.names())} real frames and on frames that the twin draws of a sound {name}, with "
+            f"The same conditions on {len(plan.source)} real frames and on frames that the twin draws of a sound {name}, with "
             f"pipeline {first}. A share below 1 is margin that this sensor has already lost; {SHORT:.2f} or more is what differs from "
             "sensor to sensor anyway.",
             bad(f"It is on the bad side in {len(short)} of {len(shares)}: {', '.join(short)}.")
@@ -179,25 +167,13 @@ def _shares_section(page: Page, out: Path, plan: SweepSettings, shares: list[Sha
     chart = write_chart(out / "plots" / "real-on-rendered.png", lambda: shares_figure(shares))
     page.figures(PagePicture(chart, "Severities at which real frames fail, on those at which rendered frames do", width_px=900))
     rows = [
-        {
-            "condition": Shown(share.real.case.title, href=link_to(share.real.case.name)),
-            "parameter": _parameters(share.real.case),
-            "real": Shown(share.real.label, note=TITLES.get(share.real.measure, "")),
-            "rendered": Shown(share.rendered.label, note=TITLES.get(share.rendered.measure, "")),
-            "share": Shown(share.value, "bad" if share.short else "good"),
-        }
+        {"condition": Shown(share.real.case.title, href=link_to(share.real.case.name)), "parameter": _parameters(share.real.case)}
+        | {kind: Shown(of.label, note=TITLES.get(of.measure, "")) for kind, of in (("real", share.real), ("rendered", share.rendered))}
+        | {"share": Shown(share.value, "bad" if share.short else "good")}
         for share in shares
     ]
-    page.table(
-        rows,
-        [
-            "condition",
-            "parameter",
-            Column("real", "real frames"),
-            Column("rendered", "rendered frames"),
-            Column("share", "share", decimals=2),
-        ],
-    )
+    kinds = Column("real", "real frames"), Column("rendered", "rendered frames")
+    page.table(rows, ["condition", "parameter", *kinds, Column("share", "share", decimals=2)])
 
 
 def _limits_section(page: Page, plan: SweepSettings) -> None:
@@ -249,12 +225,14 @@ def _cases_section(page: Page, out: Path, evaluation: SweepEvaluation, envelopes
         case = envelope.case
         page.heading(case.title, anchor=case.name)
         plot = write_chart(out / "plots" / f"{case.name}.png", partial(case_figure, case, evaluation.curves, rendered), dpi=CASE_DPI)
-        chart, worst = PagePicture(plot, f"Measures against {_parameters(case)}"), _worst(out, cells, envelope)
-        if worst is None:
-            page.figures(chart)
+        chart, own = PagePicture(plot, f"Measures against {_parameters(case)}"), [cell for cell in cells if cell.case == case]
+        beyond = next((cell for cell in own if cell.severity >= envelope.severity and cell.severity > 0), own[-1])
+        path = out / "pictures" / f"{beyond.file}.jpg"
+        if path.is_file():
+            worst = PagePicture(path, f"Worst frame under {case.title}", case.label(beyond.severity), "frame")
+            page.figures(worst, chart, layout="beside")
         else:
-            path, label = worst
-            page.figures(PagePicture(path, f"Worst frame under {case.title}", label, "frame"), chart, layout="beside")
+            page.figures(chart)
 
 
 def _parameters(case: DegradedCase) -> str:
@@ -273,23 +251,12 @@ def compare(envelopes: list[Envelope], ours: str, theirs: str) -> dict:
     return {"ours": ours, "theirs": theirs, "cases": len(pairs), "as_wide": len(wider), "twice": len(twice), "narrower": narrower}
 
 
-def _worst(out: Path, cells: list[SweepCell], envelope: Envelope) -> tuple[Path, str] | None:
-    """Picture and label of the worst frame at the first severity above the envelope, or at the last one."""
-    case = envelope.case
-    own = [cell for cell in cells if cell.case == case]
-    cell = next((c for c in own if c.severity >= envelope.severity and c.severity > 0), own[-1])
-    path = out / "pictures" / f"{cell.file}.jpg"
-    return (path, case.label(cell.severity)) if path.is_file() else None
-
-
 def _row(e: Envelope) -> dict:
-    single = len(e.case.conditions) == 1
-    ends = (e.width, e.held, e.failed if e.reached else None)
-    value, held, failed = (e.case.conditions[0].value(end) if single and end is not None else None for end in ends)
-    return {
-        "condition": e.case.name, "pipeline": e.pipeline, "severity": round(e.width, 4), "reached": bool(e.reached), "measure": e.measure,
-        "value": value, "held": held, "failed": failed, "unit": e.case.conditions[0].unit if single else "",
-    }  # fmt: skip
+    single, c = len(e.case.conditions) == 1, e.case.conditions[0]
+    ends = {"value": e.width, "held": e.held, "failed": e.failed if e.reached else None}
+    row = {"condition": e.case.name, "pipeline": e.pipeline, "severity": round(e.width, 4), "reached": bool(e.reached)}
+    values = {key: c.value(end) if single and end is not None else None for key, end in ends.items()}
+    return row | {"measure": e.measure} | values | {"unit": c.unit if single else ""}
 
 
 def _share_row(share: Share) -> dict:

@@ -3,7 +3,6 @@
 The contacts of rendered frames are solved once and stored. All conditions that do not change the mechanics use the same contacts.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -86,14 +85,11 @@ class RenderedSource:
     spec: SensorSpec
     contacts: tuple[ObjectContact, ...]
 
-    @property
-    def form(self) -> Form:
-        """Form of the frames."""
-        return Form.RAW
+    form = Form.RAW
+    """Form of the frames."""
 
-    def names(self) -> list[str]:
-        """Names of the frames."""
-        return [contact.name for contact in self.contacts]
+    def __len__(self) -> int:
+        return len(self.contacts)
 
     @property
     def rest_frame(self) -> Frame:
@@ -103,17 +99,9 @@ class RenderedSource:
     def render(self, case: DegradedCase, severity: float) -> list[DegradedFrame]:
         """The frames degraded by a case. Contacts that cannot be solved are omitted."""
         spec = case.on_spec(self.spec, severity)
-        view = PictureView.of(spec, np.zeros((spec.pins.count, 2)))
-        geometry = _with_light_of(self.spec, spec)
-        shots = []
-        lit = spec.alter(response=self.spec.response)
-        for film in _films(lit, geometry, geometry if case.solves else self.spec, self.contacts):
-            view = replace(view, caps_px=film.truth.caps_px)
-            light = case.on_light(film.light, severity, view, film.draw)
-            image = case.on_frame(expose(light, spec.capture, np.random.default_rng(film.draw)), severity, view, film.draw)
-            shot = _degrade(film.contact.name, image, self.form, [(case, severity)], view, film.truth.visible)
-            shots.append(replace(shot, touched=film.contact.pose.indent_mm > 0))
-        return shots
+        view, geometry = PictureView.of(spec, np.zeros((spec.pins.count, 2))), _with_light_of(self.spec, spec)
+        films = _films(spec.alter(response=self.spec.response), geometry, geometry if case.solves else self.spec, self.contacts)
+        return [_expose(name, light, truth, case, severity, view, draw, touched) for draw, name, light, truth, touched in films]
 
 
 @dataclass(frozen=True)
@@ -140,34 +128,27 @@ class RealSource:
         """Form of the frames."""
         return self.frames[0].form
 
-    def names(self) -> list[str]:
-        """Names of the frames."""
-        return [frame.name for frame in self.frames]
+    def __len__(self) -> int:
+        return len(self.frames)
 
     def render(self, case: DegradedCase, severity: float) -> list[DegradedFrame]:
         """The frames degraded by a case, which must be `image_level`."""
         neutral = self.spec.alter(**NEUTRAL)
         spec = case.on_spec(neutral, severity)
-        in_light = severity > 0 and self.form == Form.RAW and any(c.spec is not None or c.light is not None for c in case.conditions)
-        view = PictureView.of(neutral, self.caps_px[0])
-        shots = []
+        in_light = severity > 0 and self.form == Form.RAW and case.in_light
+        view, shots = PictureView.of(neutral, self.caps_px[0]), []
         for draw, (frame, caps_px) in enumerate(zip(self.frames, self.caps_px, strict=True)):
             view, image = replace(view, caps_px=caps_px, size_px=frame.image.shape[1::-1]), frame.image
             if in_light:
                 light = to_light(image, neutral.response).astype(np.float32)
                 image = expose(case.on_light(light, severity, view, draw), spec.capture, np.random.default_rng(draw))
             image = case.on_frame(image, severity, view, draw)
-            shots.append(_degrade(frame.name, image, self.form, [(case, severity)], view, np.isfinite(caps_px[:, 0])))
+            shots.append(_degrade(frame.name, image, self.form, case, severity, view, np.isfinite(caps_px[:, 0])))
         return shots
 
 
 def degraded_state(
-    spec: SensorSpec,
-    state: AnyPinState,
-    cases: Sequence[tuple[DegradedCase, float]],
-    *,
-    shading: Shading | None = None,
-    touched: bool = True,
+    spec: SensorSpec, state: AnyPinState, cases: list[tuple[DegradedCase, float]], *, shading: Shading | None = None, touched: bool = True
 ) -> DegradedFrame:
     """One contact under several cases, each at a severity of its own; they act one after the other at every stage.
 
@@ -176,7 +157,7 @@ def degraded_state(
     spec : SensorSpec
     state : ContactState or PinRest
         The contact of the sensor as it is.
-    cases : sequence of (Case, float)
+    cases : list of (Case, float)
     shading : Shading, optional
         Of the preview that draws the frame; direct light alone by default.
     touched : bool
@@ -189,20 +170,11 @@ def degraded_state(
     """
     if solved := [case.name for case, _ in cases if case.solves]:
         raise TwinError(f"{', '.join(solved)}: changes the mechanics, so this contact would be another one; use 'twin robustness'")
-    degraded = spec
-    for case, severity in cases:
-        degraded = case.on_spec(degraded, severity)
-    geometry = _with_light_of(spec, degraded)
-    lit = degraded.alter(response=spec.response)
-    truth = cap_truth(geometry, rest_pins(spec.geometry), state, Form.RAW)
-    view = replace(PictureView.of(degraded, truth.caps_px), caps_px=truth.caps_px)
-    light = Preview(lit, shading=shading).render(state)
-    for case, severity in cases:
-        light = case.on_light(light, severity, view, 0)
-    image = expose(light, degraded.capture, np.random.default_rng(0))
-    for case, severity in cases:
-        image = case.on_frame(image, severity, view, 0)
-    return replace(_degrade("contact", image, Form.RAW, cases, view, truth.visible), touched=touched)
+    together = DegradedCase(tuple(replace(c, severe=c.value(severity)) for case, severity in cases if severity for c in case.conditions))
+    degraded = together.on_spec(spec, 1.0)
+    truth = cap_truth(_with_light_of(spec, degraded), rest_pins(spec.geometry), state, Form.RAW)
+    light = Preview(degraded.alter(response=spec.response), shading=shading).render(state)
+    return _expose("contact", light, truth, together, 1.0, PictureView.of(degraded, truth.caps_px), 0, touched)
 
 
 def pins_under(spec: SensorSpec, contact: ObjectContact) -> PinRest:
@@ -226,13 +198,21 @@ def pins_under(spec: SensorSpec, contact: ObjectContact) -> PinRest:
     return PinRest(**cached_arrays("pins-under-contact", key, solve))
 
 
-def _degrade(
-    name: str, image: np.ndarray, form: Form, cases: Sequence[tuple[DegradedCase, float]], view: PictureView, visible: np.ndarray
+def _expose(
+    name: str, light: np.ndarray, truth: CapTruth, case: DegradedCase, severity: float, view: PictureView, draw: int, touched: bool
 ) -> DegradedFrame:
-    """A shot whose pins lie and are visible as the cases, each at its severity, leave them."""
-    caps_px, gone = view.caps_px, np.zeros(len(view.caps_px), bool)
-    for case, severity in cases:
-        caps_px, gone = case.on_points(caps_px, severity, view), gone | case.missing_caps(severity, view)
+    """The frame that the camera of a view makes of undegraded light; ``draw`` is the seed of its random numbers."""
+    view = replace(view, caps_px=truth.caps_px)
+    light = case.on_light(light, severity, view, draw)
+    image = case.on_frame(expose(light, view.spec.capture, np.random.default_rng(draw)), severity, view, draw)
+    return replace(_degrade(name, image, Form.RAW, case, severity, view, truth.visible), touched=touched)
+
+
+def _degrade(
+    name: str, image: np.ndarray, form: Form, case: DegradedCase, severity: float, view: PictureView, visible: np.ndarray
+) -> DegradedFrame:
+    """A degraded image with its pins where the case leaves them."""
+    caps_px, gone = case.on_points(view.caps_px, severity, view), case.missing_caps(severity, view)
     inside = np.all((caps_px >= 0) & (caps_px <= np.array(image.shape[1::-1]) - 1), axis=1)
     return DegradedFrame(name, Frame(image, form, name), caps_px, visible & inside & ~gone)
 
@@ -244,21 +224,14 @@ def _with_light_of(base: SensorSpec, spec: SensorSpec) -> SensorSpec:
     return alike.alter(**{name: getattr(base, name) for name in ("leds", "housing", "appearance", "response")})
 
 
-@dataclass(frozen=True)
-class _ContactFilm:
-    """Linear light of one contact before the camera's response, and its true pins; ``draw`` is the seed of its random numbers."""
-
-    draw: int
-    contact: ObjectContact
-    light: np.ndarray
-    truth: CapTruth
-
-
 @lru_cache(maxsize=2)
-def _films(spec: SensorSpec, geometry: SensorSpec, mechanics: SensorSpec, contacts: tuple[ObjectContact, ...]) -> tuple[_ContactFilm, ...]:
-    """Films of contacts of the sensor ``mechanics``, projected by the camera of ``geometry``, with the lights of ``spec``.
+def _films(
+    spec: SensorSpec, geometry: SensorSpec, mechanics: SensorSpec, contacts: tuple[ObjectContact, ...]
+) -> tuple[tuple[int, str, np.ndarray, CapTruth, bool], ...]:
+    """Contacts of the sensor ``mechanics``, projected by the camera of ``geometry``, with the lights of ``spec``.
 
-    All conditions that act after the film use these films. Contacts that cannot be solved are omitted.
+    All conditions that act after the film use the same ones. Contacts that cannot be solved are omitted. Of each: the seed of its random
+    numbers, its name, its linear light before the camera's response, its true pins, and whether anything is touched.
     """
     preview, films = Preview(spec), []
     for draw, contact in enumerate(contacts):
@@ -268,7 +241,7 @@ def _films(spec: SensorSpec, geometry: SensorSpec, mechanics: SensorSpec, contac
             continue
         light = preview.render(state)
         light.flags.writeable = False  # the array is shared by all conditions
-        films.append(_ContactFilm(draw, contact, light, truth))
+        films.append((draw, contact.name, light, truth, contact.pose.indent_mm > 0))
     return tuple(films)
 
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.errors import ErrorsAs, FrameError, OptionError, TwinError, format_count
-from twin.evaluation.degradation.condition import DegradedCase
 from twin.evaluation.degradation.shots import RealSource
 from twin.evaluation.degradation.sweep import SweepSettings
 from twin.frames import evenly_read, open_recording
@@ -19,7 +18,7 @@ from twin.pins import METHODS, DetectorSpec, load_detector, make_detector, shipp
 from twin.pins.detectors.detector_spec import OWN
 from twin.pins.detectors.own_finder import is_own, own_detector, own_name, own_places
 from twin.pins.detectors.tune import tune
-from twin.progress import Progress, Step, silent, stage
+from twin.progress import Progress, Step, report_each, silent, stage
 from twin.store import Item, inputs_digest
 from twin.types import Form, Frame
 
@@ -50,7 +49,7 @@ def real_settings(
     built_in = [each for each in detectors if each.method != OWN]  # what is evaluated must not say what is true
     source, notes = consensus(spec, frames, list(dict.fromkeys((*built_in, *judges))))
     notes += recording.notes()
-    usable = tuple(c for c in cases if c.image_level and (recording.form == Form.RAW or _on_frames(c)))
+    usable = tuple(case for case in cases if case.image_level and (recording.form == Form.RAW or not case.in_light))
     if not usable:
         raise TwinError("none of the conditions can be applied to frames that are already there; without `frames` they are rendered")
     if left := [c.name for c in cases if c not in usable]:
@@ -79,18 +78,11 @@ def check_pipelines(names: list[str], models: tuple[str, ...] = ()) -> None:
                 f"`pipeline` {name}: give one of {', '.join(METHODS)}, a .toml file written by 'twin tune', or a function of yours as "
                 "FILE.py:FUNCTION"
             )
-    called = [_name_of(name) for name in names]
+    called = [own_name(name) if is_own(name) else name if name in METHODS else load_detector(Path(name)).name for name in names]
     if len(set(called)) < len(called):
         raise OptionError(f"`pipeline`: each needs a name of its own, got {', '.join(called)}; rename the files or functions")
     if len({*called, *models}) < len(called) + len(models):
         raise OptionError(f"`model`: each needs a name of its own, got {', '.join((*called, *models))}; rename the runs' folders")
-
-
-def _name_of(name: str) -> str:
-    """How a pipeline is called in the tables."""
-    if is_own(name):
-        return own_name(name)
-    return name if name in METHODS else load_detector(Path(name)).name
 
 
 def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], folder: Path, progress: Step) -> tuple[DetectorSpec, ...]:
@@ -103,8 +95,8 @@ def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], fo
         A file cannot be read (`check_pipelines` finds this before any work is done), or a function fails on the first undegraded frame.
     """
     chosen, inputs = [], inputs_digest(spec, [frame.image for frame in frames])
-    for k, name in enumerate(names):
-        progress(k, len(names))
+    progress(0, len(names))
+    for name in report_each(names, progress):
         method = next((known for known in METHODS if known == name), None)
         if is_own(name):
             chosen.append(_check_detector(own_detector(name, spec, frames[0].form), frames[0]))
@@ -120,7 +112,6 @@ def choose_pipelines(names: list[str], spec: SensorSpec, frames: list[Frame], fo
                 tuned = tune(frames, spec, method).detector
                 write_detector(kept, tuned, f"Tuned on undegraded frames.\nmade_by = {json.dumps(item.made_by)}")
             chosen.append(load_detector(kept).alter(name=method))
-        progress(k + 1, len(names))
     return tuple(chosen)
 
 
@@ -143,28 +134,16 @@ def consensus(spec: SensorSpec, frames: list[Frame], detectors: list[DetectorSpe
     kept, truth, refused = [], [], []
     for frame in frames:
         seen = np.stack([found.pins_px for found in (find(frame) for find in finders) if found.pins_px is not None])
-        middle, agreeing = _consensus(seen)
-        known = agreeing >= LEAST_AGREEING
+        pitch = np.nanmedian(np.sort(np.linalg.norm(seen[0][:, None] - seen[0][None], axis=2), axis=1)[:, 1])
+        known = (np.linalg.norm(seen - seen[0], axis=2) < AGREE * pitch).sum(axis=0) >= LEAST_AGREEING
         if known.mean() < LEAST_KNOWN:
             refused.append(f"{frame.name}: the detectors agree on {int(known.sum())} of {len(known)} pins only")
             continue
         kept.append(frame)
-        truth.append(np.where(known[:, None], middle, np.nan))
+        truth.append(np.where(known[:, None], seen[0], np.nan))
     if not kept:
         raise FrameError(
             f"none of {format_count(len(frames), 'frames')} is good enough to start from; the first: {refused[0]}; "
             "try 'twin tune', then 'twin check'"
         )
     return RealSource(spec, tuple(kept), np.stack(truth)), refused
-
-
-def _consensus(seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places (N, 2) of the pins by the first of D detectors (D, N, 2), and number (N,) of detectors that agree, including the first."""
-    pitch = np.nanmedian(np.sort(np.linalg.norm(seen[0][:, None] - seen[0][None], axis=2), axis=1)[:, 1])
-    near = np.linalg.norm(seen - seen[0], axis=2) < AGREE * pitch
-    return np.where(np.isfinite(seen[0]), seen[0], np.nan), near.sum(axis=0)
-
-
-def _on_frames(case: DegradedCase) -> bool:
-    """Whether a case acts on gray levels or settings alone. Only such cases can be applied to thresholded frames."""
-    return all(c.light is None and c.spec is None for c in case.conditions)

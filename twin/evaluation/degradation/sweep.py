@@ -49,8 +49,8 @@ class SweepSettings:
     cases : tuple of Case
     severities : tuple of float
         Increasing; the first is 0.
-    between : dict of str to set of float
-        Further severities by the case's name.
+    between : set of (str, float)
+        Further severities, each with its case's name.
     models : callable, optional
         Returns models by name; each process calls it once.
     model_digests : dict of str to str
@@ -61,7 +61,7 @@ class SweepSettings:
     detectors: tuple[DetectorSpec, ...]
     cases: tuple[DegradedCase, ...]
     severities: tuple[float, ...] = SEVERITIES
-    between: dict[str, set[float]] = field(default_factory=dict)
+    between: frozenset[tuple[str, float]] = frozenset()
     models: Models | None = None
     model_digests: dict[str, str] = field(default_factory=dict)
 
@@ -85,7 +85,7 @@ def cells_of(plan: SweepSettings) -> list[SweepCell]:
     base = inputs_digest(_inputs(plan))
     cells = []
     for case in plan.cases:
-        for severity in sorted({*plan.severities, *plan.between.get(case.name, ())}):
+        for severity in sorted({*plan.severities, *(severity for name, severity in plan.between if name == case.name)}):
             degrading = () if severity == 0 else case.conditions
             name = case.name if degrading else "nominal"
             values = [[c.name, c.value(severity)] for c in degrading]

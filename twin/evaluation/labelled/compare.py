@@ -55,7 +55,8 @@ def compare(model: ContactModel, measured: MeasuredFrames, *, friction_frames: i
     ``friction_frames`` is the number of frames whose friction is fitted. They are spread evenly over the frames with an executed move.
     """
     executed = np.array([label.executed for label in measured.labels])
-    sought = _evenly(np.flatnonzero(executed), friction_frames)
+    moved = np.flatnonzero(executed)
+    sought = moved[np.linspace(0, len(moved) - 1, min(friction_frames, len(moved))).astype(int)]
     total, done = len(measured) + len(sought) * len(FRICTIONS), 0
     simulated, failures = np.full(measured.pins_px.shape, np.nan), {}
 
@@ -70,10 +71,9 @@ def compare(model: ContactModel, measured: MeasuredFrames, *, friction_frames: i
             simulated[row] = simulate(row)
         except ContactError as failure:
             failures[name] = str(failure)
-    errors = np.full(len(measured), np.nan)
+    errors, best, best_error = np.full((3, len(measured)), np.nan)
     solved = ~np.isnan(simulated[:, 0, 0])
     errors[solved] = pin_errors(simulated[solved], measured.pins_px[solved])
-    best, best_error = np.full(len(measured), np.nan), np.full(len(measured), np.nan)
     best[sought], best_error[sought] = model.rig.friction, errors[sought]
     for row in sought.tolist():
         for friction in FRICTIONS:
@@ -83,7 +83,10 @@ def compare(model: ContactModel, measured: MeasuredFrames, *, friction_frames: i
                 continue
             if not error >= best_error[row]:  # also true if the contact failed with the rig's friction (NaN)
                 best[row], best_error[row] = friction, error
-    return Comparison(measured, simulated, errors, executed, _measures(model, measured), best, best_error, failures)
+    axis, (poses, moves) = model.experiment.axis, poses_and_moves(measured.labels)
+    depth, across = poses[:, axis], np.delete(moves[:, :3], axis, axis=1)
+    by = {"depth_mm": depth, "angle_deg": np.linalg.norm(poses[:, 3:], axis=1), "shear_mm": np.linalg.norm(across, axis=1)}
+    return Comparison(measured, simulated, errors, executed, by, best, best_error, failures)
 
 
 def table_of(found: Comparison) -> list[dict]:
@@ -111,21 +114,3 @@ def binned_means(values: np.ndarray, by: np.ndarray, edges: Sequence[float]) -> 
     """Mean of the values whose ``by`` is in each bin (the last bin includes its upper edge); NaN for an empty bin."""
     where = np.clip(np.searchsorted(edges, by, side="right") - 1, 0, len(edges) - 2)
     return np.array([values[where == k].mean() if (where == k).any() else np.nan for k in range(len(edges) - 1)])
-
-
-def _evenly(rows: np.ndarray, count: int) -> np.ndarray:
-    """At most ``count`` of the rows, spread evenly, including the first and the last."""
-    if not count or not len(rows):
-        return rows[:0]
-    return rows[np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(int)]
-
-
-def _measures(model: ContactModel, measured: MeasuredFrames) -> dict[str, np.ndarray]:
-    """The measures (M,) of all frames by which the errors are tabled."""
-    axis = model.experiment.axis
-    poses, moves = poses_and_moves(measured.labels)
-    return {
-        "depth_mm": poses[:, axis],
-        "angle_deg": np.linalg.norm(poses[:, 3:], axis=1),
-        "shear_mm": np.linalg.norm(np.delete(moves[:, :3], axis, axis=1), axis=1),
-    }

@@ -17,15 +17,11 @@ from twin.store import made_by, write_json
 def summary_of(found: Comparison, sensor: str) -> dict:
     """All figures of a comparison, as ``validation.json`` holds them; ``sensor`` is the sensor's name."""
     moved = np.linalg.norm(found.measured.pins_px - found.measured.no_contact_px, axis=-1)
-    sought = np.isfinite(found.friction_error_px)
-    friction = {}
+    sought, friction = np.isfinite(found.friction_error_px), {}
     if sought.any():
-        friction = {
-            "frames": int(sought.sum()),
-            "error_px": float(found.friction_error_px[sought].mean()),
-            "error_with_common_friction_px": float(np.nanmean(found.error_px[sought])),
-            "median": float(np.median(found.friction[sought])),
-        }
+        friction = {"frames": int(sought.sum()), "error_px": float(found.friction_error_px[sought].mean())}
+        friction["error_with_common_friction_px"] = float(np.nanmean(found.error_px[sought]))
+        friction["median"] = float(np.median(found.friction[sought]))
     return {
         "sensor": sensor,
         "form": str(found.measured.form),
@@ -72,10 +68,8 @@ def write_validation(out: Path, found: Comparison, description: str, summary: di
     page.notice("Contacts that failed", [f"{name}: {reason}" for name, reason in summary["failed"].items()], tone="bad")
     page.notice("Noted", summary["problems"])
     page.section("With nothing free")
-    page.table(
-        summary["table"],
-        [Column("group", "frames whose move was"), Column("frames", "frames"), Column("error_px", "error", "px", decimals=2)],
-    )
+    columns = [Column("group", "frames whose move was"), Column("frames", "frames"), Column("error_px", "error", "px", decimals=2)]
+    page.table(summary["table"], columns)
     for key, title in MEASURES.items():
         _binned_table(page, summary["table"], key, title)
     page.figures(PagePicture(errors, "Error of each frame by depth, turn and shear"))
@@ -98,21 +92,17 @@ def _binned_table(page: Page, rows: list[dict], key: str, title: str) -> None:
     if not binned:
         return
     name, _, unit = title.partition(", ")
-    edges = binned[0]["by"][key]["edges"]
-    bins = [
-        Column(f"bin_{k}", f"{number(low, decimals=1)} to {number(high, decimals=1)}", unit, decimals=2)
-        for k, (low, high) in enumerate(pairwise(edges))
-    ]
+    ranges = [f"{number(low, decimals=1)} to {number(high, decimals=1)}" for low, high in pairwise(binned[0]["by"][key]["edges"])]
+    bins = [Column(f"bin_{k}", text, unit, decimals=2) for k, text in enumerate(ranges)]
     shown = [{"group": row["group"]} | {f"bin_{k}": mean for k, mean in enumerate(row["by"][key]["means"])} for row in binned]
     page.table(shown, [Column("group", "error in px"), *bins], caption=f"By {name}")
 
 
 def _frame_rows(found: Comparison) -> list[dict[str, object]]:
+    numbers = found.by | {"error_px": found.error_px, "own_friction": found.friction, "error_own_friction_px": found.friction_error_px}
     rows: list[dict[str, object]] = []
     for k, name in enumerate(found.measured.names):
-        numbers = {key: found.by[key][k] for key in MEASURES} | {"error_px": found.error_px[k], "own_friction": found.friction[k]}
-        numbers["error_own_friction_px"] = found.friction_error_px[k]
-        known = {key: value if np.isfinite(value) else None for key, value in numbers.items()}
+        known = {key: values[k] if np.isfinite(values[k]) else None for key, values in numbers.items()}
         rows.append({"image_name": name, "executed": int(found.executed[k]), **known, "failure": found.failures.get(name, "")})
     return rows
 
@@ -132,9 +122,8 @@ def _draw_worst(found: Comparison) -> Figure:
     order = np.argsort(np.where(np.isfinite(found.error_px), found.error_px, -1.0))[-np.isfinite(found.error_px).sum() :]
     figure, axes = new_figure(2, panel_inch=5.0)
     for ax, k, title in ((axes[0], order[len(order) // 2], "median frame"), (axes[1], order[-1], "worst frame")):
-        measured, simulated = found.measured.pins_px[k], found.simulated_px[k]
-        seen = np.isfinite(measured[:, 0])
-        real, made = measured[seen], simulated[seen]
+        seen = np.isfinite(found.measured.pins_px[k, :, 0])
+        real, made = found.measured.pins_px[k, seen], found.simulated_px[k, seen]
         text = f"{title}: real pin to simulated\n{found.measured.names[k]}"
         draw_displacement(ax, real, made, text, enlarged=enlargement(real, made))
     return figure

@@ -3,21 +3,29 @@
 The figures are PSNR, SSIM (Wang et al. 2004, computed by scikit-image) and FLIP (Andersson et al. 2020). FLIP is the difference, from 0 to
 1, that is visible when both pictures alternate on a normal screen (67 px per degree). Outside the disc both pictures are made equal, so
 that these pixels do not affect SSIM and FLIP near the disc's edge.
+
+A part of what renders miss on the caps is a picture fixed to each cap (``fixed_share``), which a better relief could hold.
 """
 
 from dataclasses import dataclass
 
+import cv2
 import flip_evaluator
 import numpy as np
 from skimage.metrics import structural_similarity
 
+from scenes.sensor import PinsSpec, ViewSpec
 from twin.errors import FrameError
 from twin.frames.forms import gray_levels
+from twin.optics.relief import SKIN_FROM, cap_planes
+from twin.types import FloatArray, ImageArray, PinState
 
 # Range of 8-bit gray levels.
 LEVELS = 255.0
 # Amplification of the difference picture.
 CHANGE_GAIN = 2
+# Places along the diameter of a cap and its edge at which a difference is read.
+PLACES = 19
 
 
 @dataclass(frozen=True)
@@ -77,3 +85,34 @@ def _ssim(real: np.ndarray, rendered: np.ndarray, inside: np.ndarray) -> float:
     axis = 2 if real.ndim == 3 else None
     _, local = structural_similarity(real, rendered, data_range=LEVELS, channel_axis=axis, full=True)
     return float(local[inside].mean())
+
+
+def cap_patches(view: ViewSpec, pins: PinsSpec, state: PinState, real: ImageArray, rendered: ImageArray) -> FloatArray:
+    """Real less rendered gray levels (N, k) at the same places of all caps' planes, up to ``SKIN_FROM`` cap radii from their middles.
+
+    Parameters
+    ----------
+    real, rendered : (H, W) or (H, W, C) uint8
+        Of the same state. Of C channels the levels at the k / C places follow one another.
+    """
+    side = np.linspace(-SKIN_FROM, SKIN_FROM, PLACES)
+    places = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    places = places[np.linalg.norm(places, axis=1) <= SKIN_FROM]
+    middle, plane = cap_planes(view, pins, state)
+    at = (middle[:, None] + np.einsum("nij,pj->npi", plane, places)).astype(np.float32)
+    difference = real.astype(np.float32) - rendered.astype(np.float32)
+    read = cv2.remap(difference, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(read, np.float32).reshape(len(middle), -1)
+
+
+def fixed_share(patches: FloatArray) -> float:
+    """Share of the power of patches (M, N, k) that is the same for a cap in all M frames; without bias, so that it may be below 0.
+
+    The mean over pairs of different frames of the product of their patches, relative to the mean square. A mean over the frames alone
+    would count 1 / M of what changes from frame to frame. NaN if there is one frame, or nothing is missed.
+    """
+    count, values = len(patches), np.asarray(patches, float)
+    power = float(np.sum(values**2))
+    if count < 2 or power == 0:
+        return np.nan
+    return float((np.sum(values.sum(axis=0) ** 2) - power) / (count - 1) / power)

@@ -9,8 +9,7 @@ from matplotlib.figure import Figure
 from scenes.sensor import SensorSpec
 from twin.evaluation.pictures.compare import Pair, PoseAligned
 from twin.evaluation.pictures.images import difference_picture
-from twin.evaluation.pictures.spectra import RadialRow
-from twin.evaluation.pictures.statistics import RADIAL_MEASURES, TARGET, TARGET_MEASURES, Statistics
+from twin.evaluation.pictures.statistics import RADIAL_MEASURES, TARGET, TARGET_MEASURES, RadialRow, Statistics
 from twin.frames import distinct_stems
 from twin.frames.images import write_image
 from twin.report.charts import sized_figure, write_chart
@@ -28,21 +27,6 @@ NAMES = {
     "skin_level": "bare skin, gray",
     "noise_sd": "noise, sd in gray levels",
 }
-
-
-def write_pictures(folder: Path, pairs: list[Pair], kind: str) -> list[dict]:
-    """Write the real, the rendered and the difference picture of every pair. Returns rows for the page."""
-    folder.mkdir(exist_ok=True)
-    rows = []
-    for pair, stem in zip(pairs, distinct_stems([pair.real.frame.name for pair in pairs]), strict=True):
-        row, real = _frame_row(pair, kind), pair.real.like(pair.image)
-        images = {"real": real, kind: pair.image, f"{kind}-difference": difference_picture(real, pair.image)}
-        for key, image in images.items():
-            path = folder / f"{stem}-{key}.png"
-            write_image(path, image)
-            row[key.removeprefix(f"{kind}-").replace(kind, "rendered")] = f"{folder.name}/{path.name}"
-        rows.append(row)
-    return rows
 
 
 def image_summary(pairs: list[Pair]) -> dict:
@@ -86,29 +70,22 @@ def pose_summary(found: PoseAligned) -> dict:
     }
 
 
-TABLES = {
-    "frames": "figures of each frame",
-    "radial": "measures by distance from the centre",
-    "spectrum": "radial power spectra",
-    "spots": "bright spots",
-}
-"""Tables (CSV files) and their contents."""
-
-
-def _table_rows(pairs: list[Pair], found: Statistics, poses: PoseAligned | None) -> list[list[dict]]:
-    """Rows of the ``TABLES``."""
+def _tables(pairs: list[Pair], found: Statistics, poses: PoseAligned | None) -> dict[str, tuple[str, list[dict]]]:
+    """Tables (CSV files): what they contain, and their rows."""
     frames = [_frame_row(pair, "pins") for pair in pairs] + [_frame_row(pair, "pose") for pair in (poses.pairs if poses else [])]
     radial = [vars(row) | {"relative_difference": row.difference} for row in found.radial]
-    spectrum = [
-        {"cycles_per_px": f, "real": a, "rendered": b}
-        for f, a, b in zip(found.frequency, found.real_power, found.rendered_power, strict=True)
-    ]
+    powers = zip(found.frequency, found.real_power, found.rendered_power, strict=True)
     spots = [
         {"set": kind, "x_px": x, "y_px": y, "peak": peak}
         for kind, s in (("real", found.real_spots), ("rendered", found.rendered_spots))
         for (x, y), peak in zip(s.px, s.peak, strict=True)
     ]
-    return [frames, radial, spectrum, spots]
+    return {
+        "frames": ("figures of each frame", frames),
+        "radial": ("measures by distance from the centre", radial),
+        "spectrum": ("radial power spectra", [{"cycles_per_px": f, "real": a, "rendered": b} for f, a, b in powers]),
+        "spots": ("bright spots", spots),
+    }
 
 
 def _frame_row(pair: Pair, alignment: str) -> dict:
@@ -152,7 +129,7 @@ def image_columns(*, mark_best: bool = False) -> list[Column]:
 def write_results(
     out: Path, spec: SensorSpec, metrics: dict, pairs: list[Pair], found: Statistics, poses: PoseAligned | None
 ) -> list[Path]:
-    """Write ``index.html`` with its pictures, ``metrics.json`` and the ``TABLES``, and return their paths, the page first.
+    """Write ``index.html`` with its pictures, ``metrics.json`` and the tables, and return their paths, the page first.
 
     Parameters
     ----------
@@ -167,8 +144,7 @@ def write_results(
         Pose-aligned pairs.
     """
     pictures = out / "pictures"
-    rows = write_pictures(pictures, pairs, "pins")
-    pose_rows = write_pictures(pictures, poses.pairs, "pose") if poses else []
+    pictures.mkdir(exist_ok=True)
     disc = metrics["disc"]
     center = ", ".join(number(v, decimals=1) for v in disc["center_px"])
     page = Page(
@@ -201,13 +177,13 @@ def write_results(
         )
         _image_table(page, metrics["pose_aligned"]["test_images"])
     page.section("Frame by frame, pin-aligned")
-    _frame_figures(page, rows, "skin misses the pins by")
-    if pose_rows:
+    _add_frames(page, pictures, pairs, "pins", "skin misses the pins by")
+    if poses:
         page.section("Frame by frame, pose-aligned")
-        _frame_figures(page, pose_rows, "mean pin error")
+        _add_frames(page, pictures, poses.pairs, "pose", "mean pin error")
     written = [write_json(out / "metrics.json", metrics | {"made_by": made_by(__name__)})]
     page.download(written[0], "all figures of this page")
-    for (name, what), table in zip(TABLES.items(), _table_rows(pairs, found, poses), strict=True):
+    for name, (what, table) in _tables(pairs, found, poses).items():
         if table:
             written.append(write_rows(out / f"{name}.csv", table))
             page.download(written[-1], what)
@@ -221,18 +197,12 @@ def _image_table(page: Page, summary: dict) -> None:
 
 
 def _detector_text(count: int, metrics: dict) -> str:
-    def percent(share: float) -> str:
-        return number(100 * share, decimals=1)
-
-    said = (
-        f"The detector, with the parameters of the real frames, finds exactly all {count} pins in "
-        f"{percent(metrics['pin_aligned']['exact_fraction'])} % of the renders."
-    )
-    told = metrics["two_sample"]
-    if not told:
+    exact = f"{100 * metrics['pin_aligned']['exact_fraction']:.1f} % of the renders."
+    said = f"The detector, with the parameters of the real frames, finds exactly all {count} pins in {exact}"
+    if not (told := metrics["two_sample"]):
         return said
     shares = "; ".join(
-        f"{name}: {percent(test['accuracy'])} % (95 % interval {percent(test['low'])} to {percent(test['high'])} %)"
+        f"{name}: {100 * test['accuracy']:.1f} % (95 % interval {100 * test['low']:.1f} to {100 * test['high']:.1f} %)"
         for name, test in told.items()
     )
     return (
@@ -276,19 +246,20 @@ def _difference(row: RadialRow) -> Cell:
     return Cell(100 * row.difference, tone if row.measure in TARGET_MEASURES else "")
 
 
-def _frame_figures(page: Page, rows: list[dict], what: str) -> None:
-    for row in rows:
-        name = row["image_name"]
+def _add_frames(page: Page, folder: Path, pairs: list[Pair], kind: str, what: str) -> None:
+    """Write the real, the rendered and the difference picture of every pair to a folder, and show them on the page."""
+    for pair, stem in zip(pairs, distinct_stems([pair.real.frame.name for pair in pairs]), strict=True):
+        name, real, figures = pair.real.frame.name, pair.real.like(pair.image), pair.figures
         said = (
-            f"rendered: PSNR {number(row['psnr_db'], decimals=1)} dB, SSIM {number(row['ssim'], decimals=3)}, "
-            f"FLIP {number(row['flip'], decimals=3)}; {what} {number(row['pin_px'], decimals=2)} px"
-            f"{'' if row['exact'] else '; the detector loses pins'}"
+            f"rendered: PSNR {number(figures.psnr_db, decimals=1)} dB, SSIM {number(figures.ssim, decimals=3)}, "
+            f"FLIP {number(figures.flip, decimals=3)}; {what} {number(pair.remainder_px, decimals=2)} px"
+            f"{'' if pair.exact else '; the detector loses pins'}"
         )
-        page.figures(
-            PagePicture(Path(row["real"]), f"Real frame {name}", f"{name}, real", "frame"),
-            PagePicture(Path(row["rendered"]), f"Render of {name}", said, "frame"),
-            PagePicture(
-                Path(row["difference"]), f"Difference for {name}", "rendered less real, twice amplified about middle gray", "frame"
-            ),
-            layout="row",
+        less = "rendered less real, twice amplified about middle gray"
+        shown = (
+            ("real", real, f"Real frame {name}", f"{name}, real"),
+            (kind, pair.image, f"Render of {name}", said),
+            (f"{kind}-difference", difference_picture(real, pair.image), f"Difference for {name}", less),
         )
+        paths = [write_image(folder / f"{stem}-{key}.png", image) for key, image, _, _ in shown]
+        page.figures(*(PagePicture(path, alt, text, "frame") for path, (_, _, alt, text) in zip(paths, shown, strict=True)), layout="row")

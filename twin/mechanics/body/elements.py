@@ -23,19 +23,20 @@ Integration: Two Gauss points per direction are fewer than the quadratic splines
 locking. No mode loses its stiffness, because the splines are C1.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import TypeAlias
 
 import numpy as np
 
-from scenes.body import GelSpec, SkinSpec
+from scenes.body import GelSpec, RelaxationTerm, SkinSpec
 from twin.compiled import compiled
 from twin.geometry.solid import Cells, Solid
 from twin.mechanics.body.material import add_second_stress, determinant, distortion_stiffness, first_piola, invariants, law_coefficients
 from twin.types import BoolArray, FloatArray, IntArray
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # directions (i, k) of the stored stiffness blocks
-_I = np.array([i for i, _ in PAIRS])
-_K = np.array([k for _, k in PAIRS])
+FIRST, SECOND = np.array([*zip(*PAIRS, strict=True)])
+Parts: TypeAlias = tuple[Cells, FloatArray, FloatArray, FloatArray]
 _FAR_STRAIN = 1e9
 """Initial value of the entries of the stored F. No element has such an F, so all blocks are computed at the first update."""
 
@@ -52,26 +53,27 @@ class Elements:
         See ``law_coefficients``.
     difference_mpa : (m,) or (0,) float
         Given stress that is conjugate to half the difference of the two levels' volume strains; empty for an elastic body.
+    stress : (m, 8, 3, 3) or (0, 8, 3, 3) float
+        Given stress S, MPa; empty for an elastic body.
     """
 
     cells: Cells
     law: FloatArray
     difference_mpa: FloatArray = field(default_factory=lambda: np.zeros(0))
+    stress: FloatArray = field(default_factory=lambda: np.zeros((0, 8, 3, 3)))
 
-    def add_forces(self, control_mm: FloatArray, stress: FloatArray, out: FloatArray, pressure_mpa: float = 0.0) -> float:
+    def add_forces(self, control_mm: FloatArray, out: FloatArray, pressure_mpa: float = 0.0) -> float:
         """Elastic energy in N mm. The method adds its gradient with respect to the controls, in N, to ``out`` (n, 3).
 
-        ``stress`` (m, 8, 3, 3) is the given stress S in MPa, or (0, 8, 3, 3) for none. ``pressure_mpa`` (positive: tension) adds its work
-        on the change of volume. If an element is inside out, the energy is infinite and ``out`` is not valid.
+        ``pressure_mpa`` (positive: tension) adds its work on the change of volume. If an element is inside out, the energy is infinite and
+        ``out`` is not valid.
         """
-        return _forces(*self._arrays, np.ascontiguousarray(control_mm), stress, pressure_mpa, out)
+        return _forces(self._parts, np.ascontiguousarray(control_mm), pressure_mpa, out)
 
     def add_volume(self, control_mm: FloatArray, out: FloatArray) -> float:
         """Increase of the volume in mm^3. The method adds its gradient with respect to the controls, in mm^2, to ``out`` (n, 3)."""
-        cells, control = self.cells, np.ascontiguousarray(control_mm)
-        return _forces(
-            cells.controls, cells.gradients, cells.weights_mm3, np.zeros(6), np.zeros(0), control, np.zeros((0, 8, 3, 3)), 1.0, out
-        )
+        nothing = np.zeros(6), np.zeros(0), np.zeros((0, 8, 3, 3))
+        return _forces((self.cells, *nothing), np.ascontiguousarray(control_mm), 1.0, out)
 
     @property
     def rest_volume_mm3(self) -> float:
@@ -82,29 +84,25 @@ class Elements:
         """Second Piola-Kirchhoff stress of the law's distortion part at the Gauss points, (m, 8, 3, 3) in MPa, and the stress of the
         difference: kappa_d times half the difference of the levels' volume strains, (m,) in MPa.
         """
-        cells = self.cells
-        stress, half = _relaxing(cells.controls, cells.gradients, cells.weights_mm3, self.law, np.ascontiguousarray(control_mm))
+        stress, half = _relaxing(self.cells, self.law, np.ascontiguousarray(control_mm))
         return stress, self.law[5] * half
 
-    def stiffness(
-        self, control_mm: FloatArray, stress: FloatArray, pressure_mpa: float, out: FloatArray, *, which: IntArray | None = None
-    ) -> None:
+    def stiffness(self, control_mm: FloatArray, pressure_mpa: float, out: FloatArray, *, which: IntArray | None = None) -> None:
         """Write the second derivative of each element's energy, N/mm, into ``out`` (m, 6, b, b), in the precision of ``out``.
 
         Block p couples direction ``PAIRS[p][0]`` of the first control with direction ``PAIRS[p][1]`` of the second; the other three blocks
         are transposes. With ``which`` (k,) int, only the blocks of these elements are computed.
         """
         which = np.arange(len(out)) if which is None else which
-        _stiffness(*self._arrays, which, np.ascontiguousarray(control_mm), stress, pressure_mpa, out)
+        _stiffness(self._parts, which, np.ascontiguousarray(control_mm), pressure_mpa, out)
 
     def find_changed(self, control_mm: FloatArray, at: FloatArray, strain: float) -> IntArray:
         """Elements (k,) in which an entry of F differs from ``at`` (m, 8, 3, 3) by more than ``strain``; ``at`` receives their new F."""
-        cells = self.cells
-        return np.flatnonzero(_find_changed(cells.controls, cells.gradients, np.ascontiguousarray(control_mm), strain, at))
+        return np.flatnonzero(_find_changed(self.cells, np.ascontiguousarray(control_mm), strain, at))
 
     @property
-    def _arrays(self) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        return self.cells.controls, self.cells.gradients, self.cells.weights_mm3, self.law, self.difference_mpa
+    def _parts(self) -> Parts:
+        return self.cells, self.law, self.difference_mpa, self.stress
 
 
 def soft_body(solid: Solid, skin: SkinSpec, gel: GelSpec) -> tuple[Elements, Elements, Elements]:
@@ -137,14 +135,81 @@ class KeptStiffness:
         self._at = np.empty((count, 8, 3, 3))
         self._made_of: tuple[Elements, float] | None = None
 
-    def update(self, kind: Elements, control_mm: FloatArray, stress: FloatArray, pressure_mpa: float, *, fresh: bool) -> None:
+    def update(self, kind: Elements, control_mm: FloatArray, pressure_mpa: float, *, fresh: bool) -> None:
         """Update the blocks to a state; with ``fresh`` all of them are computed. The other arguments are as in ``Elements.stiffness``."""
         same = self._made_of is not None and self._made_of[0] is kind and self._made_of[1] == pressure_mpa
-        if fresh or len(stress) or not same:
+        if fresh or len(kind.stress) or not same:
             self._at[:] = _FAR_STRAIN
         self._made_of = kind, pressure_mpa
         which = kind.find_changed(control_mm, self._at, self._kept_strain)
-        kind.stiffness(control_mm, stress, pressure_mpa, self.blocks, which=which)
+        kind.stiffness(control_mm, pressure_mpa, self.blocks, which=which)
+
+
+@dataclass(frozen=True)
+class History:
+    """Stress history of one kind of elements, MPa: the stress relaxes with time, which causes hysteresis and loss of energy.
+
+    The model is finite linear viscoelasticity with a Prony series (Simo 1987; Simo & Hughes, "Computational Inelasticity",
+    ch. 10): Maxwell elements H_i follow the distortion part S of the second Piola-Kirchhoff stress,
+
+        S(t) -> (1 - sum g_i) S + sum H_i,    dH_i / dt + H_i / tau_i = g_i dS / dt
+
+    They are integrated over a step h by H_i' = e^(-h / tau_i) H_i + g_i e^(-h / 2 tau_i) (S' - S). Within a step the stress is therefore
+    the elastic law times a factor, plus a given stress. So each step is still the minimisation of an energy.
+
+    Attributes
+    ----------
+    stress : (m, 8, 3, 3) float
+        S at the last state.
+    branches : (terms, m, 8, 3, 3) float
+        H at the last state.
+    difference : (m,) float
+        Stress of the kappa_d part at the last state (see ``Elements.relaxing_stress``).
+    difference_branches : (terms, m) float
+        Stress in the Maxwell elements of the kappa_d part.
+    """
+
+    stress: FloatArray
+    branches: FloatArray
+    difference: FloatArray
+    difference_branches: FloatArray
+
+    @classmethod
+    def at_rest(cls, kind: Elements, terms: tuple[RelaxationTerm, ...]) -> "History":
+        """The history of an undeformed body: all stresses are 0."""
+        count = len(kind.cells.weights_mm3) if terms else 0
+        shape = (count, 8, 3, 3)
+        return cls(np.zeros(shape), np.zeros((len(terms), *shape)), np.zeros(count), np.zeros((len(terms), count)))
+
+    def before(self, kind: Elements, terms: tuple[RelaxationTerm, ...], step_s: float) -> Elements:
+        """The elements with their law scaled for a step of duration ``step_s``, and with the given stress."""
+        if not terms:
+            return kind
+        share, fade, late = _decay(terms, step_s)
+        kept = (share * late).sum()
+        law = kind.law.copy()
+        law[[0, 1, 2, 3, 5]] *= 1 - share.sum() + kept
+        stress = np.einsum("t,tmqij->mqij", fade, self.branches) - kept * self.stress
+        return replace(kind, law=law, difference_mpa=fade @ self.difference_branches - kept * self.difference, stress=stress)
+
+    def after(self, kind: Elements, terms: tuple[RelaxationTerm, ...], step_s: float, control_mm: FloatArray) -> "History":
+        """The history after a step that ended at ``control_mm`` (n, 3); ``kind`` has the unscaled law."""
+        if not terms:
+            return self
+        share, fade, late = _decay(terms, step_s)
+        stress, difference = kind.relaxing_stress(control_mm)
+        grown = share * late
+        return History(
+            stress,
+            fade[:, None, None, None, None] * self.branches + grown[:, None, None, None, None] * (stress - self.stress),
+            difference,
+            fade[:, None] * self.difference_branches + grown[:, None] * (difference - self.difference),
+        )
+
+
+def _decay(terms: tuple[RelaxationTerm, ...], step_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    share, time = np.array([[term.fraction, term.time_s] for term in terms]).T
+    return share, np.exp(-step_s / time), np.exp(-step_s / (2 * time))
 
 
 @compiled(fastmath=True)
@@ -169,7 +234,8 @@ def deformation(x: FloatArray, slopes: FloatArray, f: FloatArray) -> None:
 
 
 @compiled(fastmath=True)
-def _find_changed(elements: IntArray, gradients: FloatArray, control: FloatArray, strain: float, at: FloatArray) -> BoolArray:
+def _find_changed(cells: Cells, control: FloatArray, strain: float, at: FloatArray) -> BoolArray:
+    elements, gradients, _ = cells
     x, f = np.zeros((3, elements.shape[1])), np.zeros((8, 3, 3))
     out = np.zeros(len(elements), np.bool_)
     for m in range(len(elements)):
@@ -251,17 +317,8 @@ def _add_prescribed(given: FloatArray, f: FloatArray, weights: FloatArray, stres
 
 
 @compiled(fastmath=True)
-def _forces(
-    elements: IntArray,
-    gradients: FloatArray,
-    weights: FloatArray,
-    law: FloatArray,
-    extra: FloatArray,
-    control: FloatArray,
-    given: FloatArray,
-    sealing: float,
-    out: FloatArray,
-) -> float:
+def _forces(parts: Parts, control: FloatArray, sealing: float, out: FloatArray) -> float:
+    (elements, gradients, weights), law, extra, given = parts
     count = elements.shape[1]
     x, push = np.zeros((3, count)), np.zeros((3, count))
     f, det, stress = np.zeros((8, 3, 3)), np.zeros(8), np.zeros((8, 3, 3))
@@ -290,18 +347,8 @@ def _forces(
 
 
 @compiled(fastmath=True)
-def _stiffness(
-    elements: IntArray,
-    gradients: FloatArray,
-    weights: FloatArray,
-    law: FloatArray,
-    extra: FloatArray,
-    which: IntArray,
-    control: FloatArray,
-    given: FloatArray,
-    sealing: float,
-    out: FloatArray,
-) -> None:
+def _stiffness(parts: Parts, which: IntArray, control: FloatArray, sealing: float, out: FloatArray) -> None:
+    (elements, gradients, weights), law, extra, given = parts
     count = elements.shape[1]
     x = np.zeros((3, count))
     f, g = np.zeros((8, 3, 3)), np.zeros((8, 3, 3))
@@ -325,7 +372,7 @@ def _stiffness(
             push = (sealing + law[4] * mean + (law[5] * half + more) * lean) * det[q]
             distortion_stiffness(law, f[q], det[q], g[q], tangent)
             for p in range(6):
-                i, k = _I[p], _K[p]
+                i, k = FIRST[p], SECOND[p]
                 for n in range(3):
                     c0 = w * (tangent[i, 0, k, n] + push * (g[q, i, 0] * g[q, k, n] - g[q, i, n] * g[q, k, 0]))
                     c1 = w * (tangent[i, 1, k, n] + push * (g[q, i, 1] * g[q, k, n] - g[q, i, n] * g[q, k, 1]))
@@ -350,15 +397,14 @@ def _stiffness(
         scale[0], scale[1] = law[4] / rest, law[5] / rest
         for p in range(6):
             for a in range(count):
-                size, lean_size = scale[0] * swell[0, _I[p], a], scale[1] * swell[1, _I[p], a]
+                size, lean_size = scale[0] * swell[0, FIRST[p], a], scale[1] * swell[1, FIRST[p], a]
                 for b in range(count):
-                    out[m, p, a, b] = product[count * p + a, b] + size * swell[0, _K[p], b] + lean_size * swell[1, _K[p], b]
+                    out[m, p, a, b] = product[count * p + a, b] + size * swell[0, SECOND[p], b] + lean_size * swell[1, SECOND[p], b]
 
 
 @compiled(fastmath=True)
-def _relaxing(
-    elements: IntArray, gradients: FloatArray, weights: FloatArray, law: FloatArray, control: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _relaxing(cells: Cells, law: FloatArray, control: FloatArray) -> tuple[FloatArray, FloatArray]:
+    elements, gradients, weights = cells
     count = elements.shape[1]
     x = np.zeros((3, count))
     f, det, stress = np.zeros((8, 3, 3)), np.zeros(8), np.zeros((8, 3, 3))

@@ -7,22 +7,21 @@ for each set of kept unknowns. The kept unknowns are not eliminated; a dense mat
 contact changes from iteration to iteration, and it is cheap to solve on this matrix.
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 from scipy.linalg import blas, lapack
 
 from twin.compiled import compiled
-from twin.mechanics.body.elements import PAIRS
+from twin.mechanics.body.elements import FIRST, SECOND
 from twin.types import BoolArray, FloatArray, IntArray
 
-Box: TypeAlias = tuple[int, int, int, int]  # first row, last row + 1, first column, last column + 1
+Box: TypeAlias = Sequence[int]  # first row, last row + 1, first column, last column + 1
 
 _LEAF_ELEMENTS = 36
 """Largest number of elements in a box that is not cut further."""
-_I = np.array([i for i, _ in PAIRS])
-_K = np.array([k for _, k in PAIRS])
 
 
 class NotPositiveDefinite(Exception):
@@ -44,28 +43,25 @@ class _Front:
     assembled : list of (which, rows)
         For each kind of element: the elements (e,) that are assembled here, and the rows (e, 3 b) of their unknowns in this front,
         direction by direction; -1 where a control is clamped.
-    children : list of (front, runs)
-        Fronts whose ``rest`` is added to this front, and the runs of their borders in it (see ``_runs``).
+    children : list of (number, places)
+        Fronts whose remaining matrix is added to this front, and the places (r,) of their borders in it, in rising order.
     head : (o, o) float
         Fortran order, lower triangle; its Cholesky factor overwrites it.
     below : (r, o) float
         Coupling of border and own unknowns.
-    rest : (r, r) float
-        Matrix that remains for the border. Other fronts use its memory before and after (see ``_make_room``).
     """
 
     own: IntArray
     border: IntArray
     controls_left: IntArray
     assembled: list[tuple[IntArray, IntArray]]
-    children: list[tuple["_Front", IntArray]]
+    children: list[tuple[int, IntArray]]
     head: FloatArray
     below: FloatArray
-    rest: FloatArray = field(default_factory=lambda: np.zeros((0, 0), np.float32))
 
 
 class FrontalSolver:
-    """Symbolic elimination of a body; ``eliminate`` then works on any matrix given by its elements.
+    """Elimination of all unknowns of a body except the kept ones, for any matrix given by its elements.
 
     Parameters
     ----------
@@ -77,6 +73,11 @@ class FrontalSolver:
         Clamped controls.
     keep : (n,) bool
         Controls that are not eliminated.
+
+    Attributes
+    ----------
+    kept : (k,) int
+        The kept unknowns.
     """
 
     def __init__(self, groups: list[IntArray], boxes: list[IntArray], fixed: BoolArray, keep: BoolArray) -> None:
@@ -113,23 +114,16 @@ class FrontalSolver:
                 own=self.unknown[own].ravel(),
                 border=self.unknown[left].ravel(),
                 controls_left=left,
-                assembled=[
-                    (
-                        which,
-                        np.ascontiguousarray(rows[self.unknown[controls]].transpose(0, 2, 1).reshape(len(which), 3 * controls.shape[1])),
-                    )
-                    for which, controls in assembled
-                ],
-                children=[(self._fronts[c], _runs(rows[self._fronts[c].border], 3 * len(own))) for c in children],
+                assembled=[(w, rows[self.unknown[c]].transpose(0, 2, 1).reshape(len(w), 3 * c.shape[1])) for w, c in assembled],
+                children=[(c, rows[self._fronts[c].border]) for c in children],
                 head=np.zeros((3 * len(own), 3 * len(own)), np.float32, order="F"),
                 below=np.zeros((3 * len(left), 3 * len(own)), np.float32, order="F"),
             )
             self._fronts.append(front)
-        self._make_room([children for _, children in tree])
-        self.kept = self._fronts[-1].border
+        self.kept, self._eliminating = self._fronts[-1].border, [front for front in self._fronts if len(front.own)]
 
-    def eliminate(self, blocks: list[FloatArray], *, shift: float = 0.0) -> "Eliminated":
-        """Eliminate all unknowns except the kept ones. The result is valid until the next call.
+    def eliminate(self, blocks: list[FloatArray], *, shift: float = 0.0) -> FloatArray:
+        """Eliminate all unknowns except the kept ones, until the next call.
 
         Parameters
         ----------
@@ -138,19 +132,25 @@ class FrontalSolver:
         shift : float
             Value added to the diagonal of the eliminated unknowns.
 
+        Returns
+        -------
+        (k, k) float
+            Remaining matrix of the kept unknowns (Schur complement); lower triangle.
+
         Raises
         ------
         NotPositiveDefinite
         """
-        for front in self._fronts:
+        rests: dict[int, FloatArray] = {}
+        for number, front in enumerate(self._fronts):
             front.head[:] = 0.0
             front.below[:] = 0.0
-            front.rest[:] = 0.0
+            rest = rests[number] = np.zeros((len(front.border), len(front.border)), np.float32, order="F")
             for block, (which, places) in zip(blocks, front.assembled, strict=True):
                 if len(which):
-                    _assemble(block, which, places, front.head, front.below, front.rest)
-            for child, runs in front.children:
-                _extend(child.rest.T, runs, front.head.T, front.below.T, front.rest.T)
+                    _assemble(block, which, places, front.head, front.below, rest)
+            for child, places in front.children:
+                _extend(rests.pop(child).T, places, front.head.T, front.below.T, rest.T)
             if not len(front.own):
                 continue
             if shift:
@@ -160,50 +160,17 @@ class FrontalSolver:
                 raise NotPositiveDefinite
             if len(front.border):
                 blas.strsm(1.0, front.head, front.below, side=1, lower=1, trans_a=1, overwrite_b=1)
-                blas.ssyrk(-1.0, front.below, beta=1.0, c=front.rest, lower=1, overwrite_c=1)
-        return Eliminated(self._fronts, self.kept)
-
-    def _make_room(self, children: list[list[int]]) -> None:
-        """Assign memory to the ``rest`` of every front. A rest is needed only until its parent has added it, so fronts share memory."""
-        room: list[int] = []
-        sizes: list[int] = []
-        unused: list[int] = []
-        for front, before in zip(self._fronts, children, strict=True):
-            if not unused:
-                unused.append(len(sizes))
-                sizes.append(0)
-            room.append(unused.pop())
-            sizes[room[-1]] = max(sizes[room[-1]], len(front.border) ** 2)
-            unused += [room[child] for child in before]
-        rooms = [np.empty(size, np.float32) for size in sizes]
-        for front, number in zip(self._fronts, room, strict=True):
-            size = len(front.border)
-            front.rest = rooms[number][: size * size].reshape(size, size, order="F")
-
-
-class Eliminated:
-    """A matrix after the elimination of all unknowns except the kept ones.
-
-    Attributes
-    ----------
-    kept : (k,) int
-        The kept unknowns.
-    matrix : (k, k) float
-        Remaining matrix of the kept unknowns (Schur complement); lower triangle.
-    """
-
-    def __init__(self, fronts: list[_Front], kept: IntArray) -> None:
-        self._fronts = [front for front in fronts if len(front.own)]
-        self.kept, self.matrix = kept, fronts[-1].rest
+                blas.ssyrk(-1.0, front.below, beta=1.0, c=rest, lower=1, overwrite_c=1)
+        return rest
 
     def inner(self, values: FloatArray) -> FloatArray:
         """The part of values (unknowns,) at the eliminated unknowns."""
         return np.delete(values, self.kept)
 
     def forward(self, right_side: FloatArray) -> FloatArray:
-        """Forward elimination of a right side (unknowns,). Its entries at ``kept`` are then the right side for ``matrix``."""
+        """Forward elimination of a right side (unknowns,). Its entries at ``kept`` are then the right side for the remaining matrix."""
         x = np.array(right_side, np.float32)
-        for front in self._fronts:
+        for front in self._eliminating:
             part = lapack.strtrs(front.head, x[front.own], lower=1)[0]
             x[front.border] -= front.below @ part
             x[front.own] = part
@@ -213,7 +180,7 @@ class Eliminated:
         """Backward substitution: the whole solution (unknowns,) from the result of ``forward`` and the solution at ``kept``."""
         x = eliminated.astype(np.float32)
         x[self.kept] = kept_values
-        for front in reversed(self._fronts):
+        for front in reversed(self._eliminating):
             x[front.own] = lapack.strtrs(front.head, x[front.own] - front.below.T @ x[front.border], lower=1, trans=1)[0]
         return x
 
@@ -223,13 +190,10 @@ def _dissect(box: Box, tree: list[tuple[Box, list[int]]]) -> int:
     row0, row1, column0, column1 = box
     children = []
     if (row1 - row0) * (column1 - column0) > _LEAF_ELEMENTS:
-        if row1 - row0 >= column1 - column0:
-            middle = row0 + (row1 - row0) // 4 * 2
-            halves = (row0, middle, column0, column1), (middle, row1, column0, column1)
-        else:
-            middle = column0 + (column1 - column0) // 4 * 2
-            halves = (row0, row1, column0, middle), (row0, row1, middle, column1)
-        children = [_dissect(half, tree) for half in halves]
+        side = 0 if row1 - row0 >= column1 - column0 else 2  # the longer one begins and ends at these places of the box
+        first, second = [*box], [*box]
+        first[side + 1] = second[side] = box[side] + (box[side + 1] - box[side]) // 4 * 2
+        children = [_dissect(half, tree) for half in (first, second)]
     tree.append((box, children))
     return len(tree) - 1
 
@@ -250,32 +214,6 @@ def whole(lower: FloatArray, shift: float) -> FloatArray:
 
 
 @compiled()
-def split_matrix(matrix: FloatArray, far: IntArray, near: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Parts of a symmetric matrix: (f, f) of the unknowns ``far``, (n, f) of ``near`` and ``far``, and (n, n) of ``near``."""
-    f, n = len(far), len(near)
-    within, across, rest = np.empty((f, f), matrix.dtype), np.empty((n, f), matrix.dtype), np.empty((n, n), matrix.dtype)
-    for i in range(f):
-        row = matrix[far[i]]
-        for j in range(f):
-            within[i, j] = row[far[j]]
-    for i in range(n):
-        row = matrix[near[i]]
-        for j in range(f):
-            across[i, j] = row[far[j]]
-        for j in range(n):
-            rest[i, j] = row[near[j]]
-    return within, across, rest
-
-
-def _runs(places: IntArray, own: int) -> IntArray:
-    """Runs (k, 3) of consecutive ``places``: index of the first, its place, and the length. A run does not cross the place ``own``."""
-    first = np.flatnonzero(np.diff(places, prepend=-2) != 1)
-    first = np.union1d(first, np.searchsorted(places, own))
-    first = first[first < len(places)]
-    return np.column_stack([first, places[first], np.diff(first, append=len(places))])
-
-
-@compiled()
 def _assemble(elements: FloatArray, which: IntArray, places: IntArray, head: FloatArray, below: FloatArray, rest: FloatArray) -> None:
     """Add the symmetric blocks of elements to the lower triangle of a front."""
     own, count = len(head), elements.shape[2]
@@ -283,7 +221,7 @@ def _assemble(elements: FloatArray, which: IntArray, places: IntArray, head: Flo
         block = elements[which[e]]
         place = places[e]
         for p in range(6):
-            i, k = _I[p], _K[p]
+            i, k = FIRST[p], SECOND[p]
             for a in range(count):
                 r = place[count * i + a]
                 if r < 0:
@@ -302,24 +240,13 @@ def _assemble(elements: FloatArray, which: IntArray, places: IntArray, head: Flo
 
 
 @compiled()
-def _extend(update: FloatArray, runs: IntArray, head: FloatArray, below: FloatArray, rest: FloatArray) -> None:
-    """Add the ``rest`` (border, border) of an earlier front to a front. All arrays are transposed, so that columns are contiguous."""
-    own = len(head)
-    for j in range(len(runs)):
-        for shift in range(runs[j, 2]):
-            source, low = update[runs[j, 0] + shift], runs[j, 1] + shift
-            for k in range(j, len(runs)):
-                skip = shift if k == j else 0
-                row, place, count = runs[k, 0] + skip, runs[k, 1] + skip, runs[k, 2] - skip
-                if place < own:
-                    _add(source[row : row + count], head[low, place : place + count])
-                elif low < own:
-                    _add(source[row : row + count], below[low, place - own : place - own + count])
-                else:
-                    _add(source[row : row + count], rest[low - own, place - own : place - own + count])
-
-
-@compiled()
-def _add(values: FloatArray, out: FloatArray) -> None:
-    for k in range(len(values)):
-        out[k] += values[k]
+def _extend(update: FloatArray, places: IntArray, head: FloatArray, below: FloatArray, rest: FloatArray) -> None:
+    """Add the remaining matrix (r, r) of an earlier front to a front. All arrays are transposed, so that columns are contiguous."""
+    own, inside = len(head), int(np.searchsorted(places, len(head)))
+    for j in range(len(places)):
+        low = places[j]
+        for k in range(j, inside):
+            head[low, places[k]] += update[j, k]
+        into, column = (below, low) if low < own else (rest, low - own)
+        for k in range(max(j, inside), len(places)):
+            into[column, places[k] - own] += update[j, k]

@@ -100,7 +100,11 @@ def add_second_stress(c01: float, f: FloatArray, out: FloatArray) -> float:
 @compiled(fastmath=True)
 def distortion_stiffness(law: FloatArray, f: FloatArray, det: float, g: FloatArray, out: FloatArray) -> None:
     """Write the second derivative of the distortion energy density with respect to F into ``out`` (3, 3, 3, 3): out[i, J, k, L], MPa."""
-    trace, scale, first = _first_invariant(f, det)
+    trace, scale = 0.0, det ** (-2 / 3)
+    for i in range(3):
+        for j in range(3):
+            trace += f[i, j] * f[i, j]
+    first = scale * trace - 3
     slope = 2 * scale * (law[0] + first * (2 * law[2] + 3 * law[3] * first))
     bend = 4 * scale * scale * (2 * law[2] + 6 * law[3] * first)
     for i in range(3):
@@ -133,17 +137,6 @@ def _add_second_stiffness(factor: float, f: FloatArray, g: FloatArray, trace: fl
                         curve -= 2 * (f[i, 0] * f[k, 0] + f[i, 1] * f[k, 1] + f[i, 2] * f[k, 2])
                     curve += second * (16 / 9 * g[i, j] * g[k, m] + 4 / 3 * g[i, m] * g[k, j])
                     out[i, j, k, m] += factor * (curve - 4 / 3 * (slopes[i, j] * g[k, m] + g[i, j] * slopes[k, m]))
-
-
-@compiled(fastmath=True)
-def _first_invariant(f: FloatArray, det: float) -> tuple[float, float, float]:
-    """tr C, J^(-2/3) and I1 - 3."""
-    trace = 0.0
-    for i in range(3):
-        for j in range(3):
-            trace += f[i, j] * f[i, j]
-    scale = det ** (-2 / 3)
-    return trace, scale, scale * trace - 3
 
 
 @compiled(fastmath=True)

@@ -28,6 +28,11 @@ PROBE_TIMEOUT_S = 60.0
 
 # Dr.Jit gets an empty home folder, so that it does not use a kernel that it compiled before with another LLVM.
 _PROBE = """
+try:  # no core dump
+    import resource
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+except ImportError:
+    pass
 import drjit as dr
 from drjit.{backend} import Float
 x = dr.arange(Float, 64)
@@ -36,13 +41,6 @@ dr.eval(y)
 assert 0 < dr.sum(y)[0] < 64
 version = dr.detail.llvm_version() if "{backend}" == "llvm" and hasattr(dr.detail, "llvm_version") else ""
 print("probe-ok", version)
-"""
-_NO_CORE_DUMP = """
-try:
-    import resource
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-except ImportError:
-    pass
 """
 
 
@@ -103,7 +101,7 @@ def _run(backend: str, library: Path) -> ProbeResult:
         env["LD_LIBRARY_PATH"] = os.pathsep.join(filter(None, [str(PRIVATE_FOLDER), os.environ.get("LD_LIBRARY_PATH")]))
         if backend == "llvm":
             env["DRJIT_LIBLLVM_PATH"] = str(library)
-        command = [sys.executable, "-c", _NO_CORE_DUMP + _PROBE.format(backend=backend)]
+        command = [sys.executable, "-c", _PROBE.format(backend=backend)]
         try:
             done = subprocess.run(command, env=env, cwd=home, capture_output=True, text=True, errors="replace", timeout=PROBE_TIMEOUT_S)
         except (subprocess.TimeoutExpired, OSError) as error:

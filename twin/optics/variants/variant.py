@@ -2,7 +2,7 @@
 
 Dr.Jit loads the first libLLVM that it finds. LLVM 15 and older abort the whole process at the first kernel (they have no instruction for
 IEEE fminimum). Therefore a library is chosen and tested here, before Dr.Jit searches for one. Nothing is imported or set before
-`use_variant` is called.
+`use_variant` is called. `with_room` makes copies of arrays that are safe to give to Dr.Jit.
 """
 
 import ctypes.util
@@ -17,7 +17,10 @@ from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeAlias, TypedDict
+from typing import Any, TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from twin.errors import RenderError
 from twin.optics.variants.probes import load_needed_libraries, probe
@@ -25,6 +28,11 @@ from twin.optics.variants.probes import load_needed_libraries, probe
 DrJit: TypeAlias = Any
 """A value of Dr.Jit or an object of Mitsuba. Their classes belong to the variant, which is chosen while the program runs."""
 
+
+Number = TypeVar("Number", np.float32, np.uint32)
+
+ROOM_BYTES = 64
+"""Size of the widest packet: 16 numbers of 4 bytes (AVX-512)."""
 OLDEST_LLVM = 16
 """Oldest usable major version of LLVM: versions 14 and 15 abort the process at the first kernel."""
 BACKENDS = ("cuda", "llvm", "scalar")
@@ -40,6 +48,24 @@ _LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 _VARIANT_VARIABLE = "TACTIP_VARIANT"
 
 
+def with_room(values: ArrayLike, dtype: type[Number]) -> NDArray[Number]:
+    """A contiguous copy of ``values`` with the same shape, which is safe to give to Dr.Jit.
+
+    Dr.Jit's vectorised variants use the memory of a NumPy array without a copy, and their kernels read it in whole packets: up to one
+    packet beyond the last element. If that is beyond the end of a mapped page, the process is killed (drjit 1.5, `arr + 1` on such an
+    array). Embree also reads beyond the last vertex. Therefore every array that is given to them has unused memory behind its end, at
+    least ``ROOM_BYTES``. A kernel is compiled again for arrays that do not begin at a multiple of a packet's size. Therefore all copies
+    begin at a multiple of ``ROOM_BYTES``.
+    """
+    values = np.asarray(values)
+    each = np.dtype(dtype).itemsize
+    room = np.zeros(values.size + 2 * (ROOM_BYTES // each), dtype)
+    first = -room.ctypes.data % ROOM_BYTES // each
+    out = room[first : first + values.size].reshape(values.shape)
+    out[...] = values
+    return out
+
+
 @dataclass(frozen=True)
 class LlvmLibrary:
     """One libLLVM found on this machine; ``reason`` states why it is not used ("" if it is used)."""
@@ -48,14 +74,6 @@ class LlvmLibrary:
     version: str
     ok: bool
     reason: str
-
-
-@dataclass(frozen=True)
-class LlvmSearch:
-    """The result of `find_llvm`: the library that works (or None), and all candidates."""
-
-    library: LlvmLibrary | None
-    candidates: tuple[LlvmLibrary, ...]
 
 
 @dataclass(frozen=True)
@@ -71,31 +89,28 @@ class VariantChoice:
         """ "cuda", "llvm" or "scalar"."""
         return self.variant.split("_")[0]
 
-    @property
-    def mono(self) -> bool:
-        """Whether the variant renders one channel instead of three."""
-        return self.variant.endswith("mono")
 
-
-def find_llvm(search: Sequence[Path] | None = None) -> LlvmSearch:
-    """The newest working LLVM library, the user's DRJIT_LIBLLVM_PATH first.
+def find_llvm(search: Sequence[Path] | None = None) -> tuple[LlvmLibrary | None, list[LlvmLibrary]]:
+    """The newest working LLVM library (or None), the user's DRJIT_LIBLLVM_PATH first; and the libraries before it, which do not work.
 
     Parameters
     ----------
     search : sequence of Path, optional
         Library files to consider instead of those in the usual places.
     """
-    looked_at = []
+    rejected = []
     wish = os.environ.get(_LLVM_VARIABLE)
     if wish:
-        looked_at.append(_judge(Path(wish), asked_for=True))
-        if looked_at[0].ok:
-            return LlvmSearch(looked_at[0], tuple(looked_at))
+        asked = _judge(Path(wish), asked_for=True)
+        if asked.ok:
+            return asked, []
+        rejected.append(asked)
     for path in _newest_first(_usual_places() if search is None else search):
-        looked_at.append(_judge(path))
-        if looked_at[-1].ok:
-            return LlvmSearch(looked_at[-1], tuple(looked_at))
-    return LlvmSearch(None, tuple(looked_at))
+        library = _judge(path)
+        if library.ok:
+            return library, rejected
+        rejected.append(library)
+    return None, rejected
 
 
 def find_cuda() -> tuple[bool, str]:
@@ -190,28 +205,21 @@ def available_variants() -> tuple[str, ...]:
     return tuple(sorted(m.group(1) for m in found if m))
 
 
-class RenderReport(TypedDict):
-    """The part of a diagnosis that is about rendering on a machine."""
+def report() -> dict[str, Any]:
+    """The part of a diagnosis that is about rendering on this machine.
 
-    variants: list[str]
-    """Variants compiled into the installed Mitsuba."""
-    used: dict[str, dict[str, str | None]]
-    """For "color" and "mono" cameras: ``variant`` (None if no variant works), ``reason``, ``llvm_path``."""
-    llvm: dict[str, str | bool] | None
-    """The LLVM library in use, as `LlvmLibrary`."""
-    llvm_rejected: list[dict[str, str | bool]]
-    """Libraries that were found and do not work."""
-    gpu: bool
-    gpu_reason: str
-    override: str | None
-    """TACTIP_VARIANT."""
-    remedy: str | None
-    """Advice on what to install; None if no rendering is slow."""
-
-
-def report() -> RenderReport:
-    """The part of a diagnosis that is about rendering on this machine."""
-    llvm = find_llvm()
+    Returns
+    -------
+    dict
+        ``variants`` : names of the variants compiled into the installed Mitsuba.
+        ``used`` : for "color" and "mono" cameras, ``variant`` (None if no variant works), ``reason`` and ``llvm_path``.
+        ``llvm`` : the LLVM library in use, as `LlvmLibrary`, or None.
+        ``llvm_rejected`` : libraries that were found and do not work.
+        ``gpu``, ``gpu_reason`` : whether a GPU works here, and the reason.
+        ``override`` : TACTIP_VARIANT.
+        ``remedy`` : advice on what to install; None if no rendering is slow.
+    """
+    llvm, rejected = find_llvm()
     gpu, gpu_reason = find_cuda()
     used: dict[str, dict[str, str | None]] = {}
     for channels in ("color", "mono"):
@@ -222,12 +230,12 @@ def report() -> RenderReport:
     return {
         "variants": list(available_variants()),
         "used": used,
-        "llvm": asdict(llvm.library) if llvm.library else None,
-        "llvm_rejected": [asdict(c) for c in llvm.candidates if not c.ok],
+        "llvm": asdict(llvm) if llvm else None,
+        "llvm_rejected": [asdict(library) for library in rejected],
         "gpu": gpu,
         "gpu_reason": gpu_reason,
         "override": os.environ.get(_VARIANT_VARIABLE),
-        "remedy": None if llvm.library or gpu else REMEDY,
+        "remedy": None if llvm or gpu else REMEDY,
     }
 
 
@@ -248,11 +256,10 @@ def _try(backend: str, variant: str, llvm_search: Sequence[Path] | None) -> tupl
     if backend == "cuda":
         works, reason = find_cuda()
         return (VariantChoice(variant, reason), "") if works else (None, reason)
-    found = find_llvm(llvm_search)
-    if found.library is None:
-        rejected = "; ".join(f"{c.path}: {c.reason}" for c in found.candidates) or "no libLLVM found"
-        return None, f"{rejected}; {REMEDY}"
-    return VariantChoice(variant, f"LLVM {found.library.version} at {found.library.path}", found.library.path), ""
+    library, rejected = find_llvm(llvm_search)
+    if library is None:
+        return None, f"{'; '.join(f'{each.path}: {each.reason}' for each in rejected) or 'no libLLVM found'}; {REMEDY}"
+    return VariantChoice(variant, f"LLVM {library.version} at {library.path}", library.path), ""
 
 
 def _judge(path: Path, *, asked_for: bool = False) -> LlvmLibrary:
@@ -300,7 +307,5 @@ def _libcuda() -> Path | None:
         return None
     places = ["/usr/lib/x86_64-linux-gnu", "/usr/lib/aarch64-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/lib/wsl/lib"]
     places += os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)
-    for place in filter(None, places):
-        if (Path(place) / name).exists():
-            return Path(place) / name
-    return None
+    found = (Path(place) / name for place in filter(None, places))
+    return next((path for path in found if path.exists()), None)

@@ -98,10 +98,10 @@ def _measure(gray: np.ndarray, pin_px: np.ndarray, others: np.ndarray, half: int
         if labels[middle] == 0:
             return None
         cap = labels == labels[middle]
-        depth = cv2.distanceTransform(cap.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        depth = inner_distance(cap)
         level = float(fine[cap & (depth >= PLATEAU * depth.max())].mean())
         skin = float(np.percentile(fine[cell & ~cap], SKIN_PERCENTILE))
-    height = cv2.distanceTransform((~cap).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    height = inner_distance(~cap)
     inwards_px = np.where(cap, depth - 0.5, 0.5 - height) / FINE
     share = (fine - skin) / (level - skin)
     x_c, y_c = columns[cap].astype(float), rows[cap].astype(float)
@@ -110,6 +110,15 @@ def _measure(gray: np.ndarray, pin_px: np.ndarray, others: np.ndarray, half: int
     eccentricity = np.sqrt(2 * root / (xx + yy + root))
     diameter = 2 * np.sqrt(cap.sum() / np.pi) / FINE
     return level, level - skin, skin, diameter, eccentricity, _edge_px(inwards_px[cell], share[cell])
+
+
+def inner_distance(inside: np.ndarray) -> np.ndarray:
+    """Distance (H, W) float32 of the pixels of a mask from its nearest other pixel, which is the root of an integer.
+
+    OpenCV's last bit depends on where the memory lies. Without its rounding, pixels at half of the largest depth would be in the plateau
+    in one run, and not in the next.
+    """
+    return np.sqrt(np.rint(np.square(cv2.distanceTransform(inside.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE))))
 
 
 def _edge_px(inwards_px: np.ndarray, share: np.ndarray) -> float:

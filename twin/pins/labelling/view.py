@@ -140,7 +140,7 @@ class PinView:
 
     def describe_ambiguity(self) -> str:
         """What can't be seen of the view, and what decides; "" if the view is sure."""
-        return "" if self.sure else UNDECIDED
+        return "" if self.sure else f"{UNDECIDED}: {DECIDES}"
 
     def require_small(self, name: str, known: str, *, contacts: bool = False) -> None:
         """Refuse a displaced picture ``name``; ``known`` says whose places are known.
@@ -164,9 +164,9 @@ NO_CONTACT_REMEDY = (
 """What to do if a frame is refused as one without contact."""
 UNDECIDED = (
     "the pins look alike under turns and mirror images of their layout, and are not those of the known unit, so a turn by a symmetry of "
-    "the layout or a mirror can't be seen: two pushes to known sides decide ('twin check FRAMES --no-contact REST --push x:FRAME --push "
-    "y:FRAME --out mine.toml')"
+    "the layout or a mirror can't be seen"
 )
+DECIDES = "two pushes to known sides decide ('twin check FRAMES --no-contact REST --push x:FRAME --push y:FRAME --out mine.toml')"
 
 
 def camera_modes(spec: SensorSpec, form: Form) -> np.ndarray:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin.errors import TwinError
-from twin.estimate import Estimate, pins_in
-from twin.evaluation.degradation.condition import Condition, DegradedCase
+from twin.estimate import Estimate
+from twin.evaluation.degradation.condition import DegradedCase
 from twin.evaluation.degradation.conditions import CONDITIONS, condition
 from twin.evaluation.degradation.measures import MEASURES, measure_frame
 from twin.evaluation.degradation.shots import DegradedFrame, degraded_state
@@ -30,11 +30,6 @@ NO_CONDITION = "nothing"
 """Name of the choice for a slider without a condition."""
 FIRST = ("defocus", "caps-missing", "camera-rolled")
 """Conditions that are selected at first, if they exist."""
-
-
-def selectable_conditions() -> dict[str, Condition]:
-    """The selectable conditions by title. Those that change mechanics or pipeline settings are left out, as the contact is given."""
-    return {f"{c.title} ({c.family})": c for c in CONDITIONS.values() if not c.solves and c.setting is None}
 
 
 @dataclass(frozen=True)
@@ -83,10 +78,8 @@ class FrameEvaluator:
         shot = degraded_state(self.spec, answer.state, cases, shading=shading, touched=touched)
         figures = measure_frame(self._detector, self._detector(shot.frame), shot)
         failed = tuple(m.title for m in MEASURES if m.exceeds(figures[m.name], self.limits[m.name]))
-        model = self.contact.model
-        estimate = None if model is None else model(shot.frame if model.form is Form.RAW else self.contact.camera.as_recorded(shot.frame))
-        of_frame = model is not None and model.form is Form.RAW
-        return EvaluatedFrame(shot, pins_in(shot.frame, estimate if of_frame else None, self._pipeline), figures, failed, estimate)
+        _, estimate, seen = self.contact.observe(shot.frame, Form.RAW, self._pipeline)
+        return EvaluatedFrame(shot, seen, figures, failed, estimate)
 
 
 class DegradeMode(PageMode):
@@ -108,19 +101,17 @@ class DegradeMode(PageMode):
         self._edge, self._finding = "", False
         self._pose: ObjectPose | None = None
         self._wanted = self.newest(self._show, "degrade")
-        conditions = selectable_conditions()
+        # by title, without those that change mechanics or settings of the pipeline, as the contact is given
+        conditions = {f"{c.title} ({c.family})": c for c in CONDITIONS.values() if not c.solves and c.setting is None}
         titles = (NO_CONDITION, *conditions)
         by_name = {c.name: title for title, c in conditions.items()}
-        self._conditions, self._choices, self._severities = conditions, [], []
+        self._conditions, self._controls = conditions, []
         with self.folder:
             for k in range(SLIDERS):
                 first = by_name.get(FIRST[k], NO_CONDITION)
-                choice = page.gui.add_dropdown(f"condition {k + 1}", titles, initial_value=first)
+                choice = page.watch(page.gui.add_dropdown(f"condition {k + 1}", titles, initial_value=first), self._restart)
                 slider = page.gui.add_slider(f"severity {k + 1}", 0.0, 1.0, 0.01, 0.0, hint="1: unusable")
-                for control in (choice, slider):
-                    control.on_update(lambda event: self._restart())
-                self._choices.append(choice)
-                self._severities.append(slider)
+                self._controls.append((choice, page.watch(slider, self._restart)))
             page.button("Find breaking point", self._find, hint="raise the severity of condition 1 until something fails; others are kept")
             page.button("Reset", self._reset)
 
@@ -145,13 +136,13 @@ class DegradeMode(PageMode):
         self._wanted.give(None)
 
     def _reset(self) -> None:
-        for slider in self._severities:
+        for _, slider in self._controls:
             put(slider, 0.0)
         self._restart()
 
     def cases(self) -> list[tuple[DegradedCase, float]]:
         """The chosen conditions with their severities."""
-        chosen = [(choice.value, float(slider.value)) for choice, slider in zip(self._choices, self._severities, strict=True)]
+        chosen = [(choice.value, float(slider.value)) for choice, slider in self._controls]
         return [(DegradedCase((condition(self._conditions[title].name),)), severity) for title, severity in chosen if title != NO_CONDITION]
 
     def _show(self, _: None) -> None:

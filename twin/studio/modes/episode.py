@@ -11,13 +11,13 @@ from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.estimate import pins_in
 from twin.geometry.pins import rest_pins
-from twin.optics.surfaces import SkinSurface
+from twin.optics.surfaces import PaintedSurface, SkinSurface
 from twin.pins import Pipeline, nominal_reference
 from twin.studio.live_page import frame_pictures
 from twin.studio.modes.mode import PageMode
 from twin.studio.page import LineChart, StudioPage
 from twin.studio.pictures import badge, number_table, pins_found
-from twin.studio.scene import PinColour, PinScene, TriangleMesh, colours
+from twin.studio.scene import PinColour, PinScene, colours
 from twin.types import FloatArray, Form, Frame, PinState
 
 AROUND_MM, MOST_BESIDE_MM = 22.0, 8.0
@@ -77,7 +77,7 @@ class EpisodeMode(PageMode):
         self._sensor, self._rest = sensor, rest_pins(sensor.geometry)
         self._pipeline, self._reference = Pipeline(sensor, form), nominal_reference(sensor, form)
         self._skin = SkinSurface(sensor.skin, self._rest.base_mm)  # interpolated between the pins' feet, because some backends give no skin
-        self._scene = PinScene(page.server, sensor, TriangleMesh(self._skin.rest_mm.astype(np.float32), self._skin.faces), self._rest)
+        self._scene = PinScene(page.server, sensor, PaintedSurface(self._skin.rest_mm.astype(np.float32), self._skin.faces), self._rest)
         self._touched: ObjectSpec | None = None
         self._middle_mm = np.zeros(3)  # of the part of the object that is shown
         self._last: EpisodeStep | None = None
@@ -112,19 +112,15 @@ class EpisodeMode(PageMode):
         way_mm = np.linalg.norm(step.pins.caps_mm - self._rest.caps_mm, axis=1)
 
         def scene() -> None:
-            self._scene.show_pins(
-                step.pins, self._skin.vertices(step.pins.base_mm).astype(np.float32), colours(way_mm, PinColour.DISPLACEMENT)
-            )
+            skin_mm = self._skin.vertices(step.pins.base_mm).astype(np.float32)
+            self._scene.show_pins(step.pins, skin_mm, colours(way_mm, PinColour.DISPLACEMENT))
             self._scene.show_object(step.T_sensor_object)
             self._scene.show_force(step.foot_mm, step.force_n)
             self._rewards.add({"reward": step.reward})
             self._forces.add(dict(zip("xyz", step.force_n.tolist(), strict=True)))
 
-        numbers = [
-            f"<span data-number='{step.number}' data-depth='0'></span>",
-            badge("episode", "moving"),
-            number_table(rows | step.description),
-        ]
+        mark = f"<span data-number='{step.number}' data-depth='0'></span>"
+        numbers = [mark, badge("episode", "moving"), number_table(rows | step.description)]
         pictures = frame_pictures(self._sensor, self._reference, step.frame, seen)
         self.put_up(pictures, f"camera, {step.frame.form} frame", numbers, also=scene)
 

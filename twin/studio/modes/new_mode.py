@@ -1,13 +1,12 @@
 """The mode 'Your own sensor': it makes a specification from a folder of frames, and the user can correct the layout."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from scenes.base import SpecError
 from scenes.files import quote
-from scenes.pins import PinsSpec, layout_from
+from scenes.pins import layout_from
 from scenes.sensor import SensorSpec
 from twin.calibration.new_sensor import NewSensor, new_sensor
 from twin.errors import ErrorsAs, TwinError
@@ -15,47 +14,18 @@ from twin.frames import Recording, frames_at, open_recording
 from twin.pins.pipeline import Pipeline
 from twin.studio.modes.mode import PageMode
 from twin.studio.modes.twin_mode import TwinMode
-from twin.studio.page import ARCHIVES, StudioPage, put
+from twin.studio.page import StudioPage, put
 from twin.studio.pictures import CONTROLS, OverlayChoices, badge, camera_picture, cell_picture, number_table, paragraph
 from twin.studio.state import FIRST_DEPTH_MM, next_path
+from twin.types import Form
 
 LARGER, SMALLER = "one larger", "one smaller"
 """Corrections of a layout: one ring more or less, or for a grid one row and one column."""
 
 
-@dataclass(frozen=True)
-class Wish:
-    """The user's input for a specification.
-
-    Attributes
-    ----------
-    frames : str
-        Folder, video or recording.
-    no_contact : str
-        A frame without contact, "" for none.
-    layout : str
-        Text for ``layout_from``; "" to have the layout identified.
-    radius_mm : float or None
-        Radius of the dome; None for that of a printed TacTip.
-    """
-
-    frames: str
-    no_contact: str
-    layout: str
-    radius_mm: float | None
-
-
-def enlarge_layout(pins: PinsSpec, by: int) -> str:
-    """A layout that is larger or smaller by one ring (a grid: by one row and column), as text for ``layout_from``.
-
-    Raises
-    ------
-    SpecError
-        The layout is a list of positions, or would become too small.
-    """
-    text = f"{pins.layout}:{pins.shape.resize(by)}"
-    layout_from(text)  # raises an error if there is no such layout
-    return text
+Wish = tuple[Path, Path | None, str, float | None]
+"""The user's input for a specification: frames, a frame without contact, text for ``layout_from`` ("" to have the layout identified), and
+the dome's radius in mm (None for that of a printed TacTip)."""
 
 
 class NewMode(PageMode):
@@ -75,36 +45,33 @@ class NewMode(PageMode):
     def __init__(self, page: StudioPage, twin: TwinMode, out: Path) -> None:
         super().__init__(page)
         self._twin, self._out = twin, out
-        self._made: NewSensor | None = None
+        self._proposed: tuple[NewSensor, Recording, Pipeline] | None = None
         self._absent = "Give the folder of your sensor's frames, in contact or not, and press 'Propose a specification'."
-        self._recording: Recording | None = None
-        self._pipeline: Pipeline | None = None
         self._making = self.newest(self._make, "new")
         self._looking = self.newest(self._look, "new-frame")
         gui = page.gui
         with self.folder:
             self._frames = gui.add_text("frames", "", hint="folder, video or recording on the studio's machine")
-            page.upload(
-                "Upload frames (zip or video)", ARCHIVES, self._take_upload, hint="or drop a folder, an archive or a video on the page"
-            )
+            page.upload_frames(self._take_upload)
             self._no_contact = gui.add_text("no-contact frame", "", hint="a picture without contact; may be empty")
             self._layout = gui.add_text("layout", "", hint="empty: identified; or rings:10, hexagon:6, grid:9x7, positions:FILE.csv")
-            self._radius = gui.add_text(
-                CONTROLS["radius_mm"], "", hint="empty: 20, that of a printed TacTip; all lengths are in proportion to it"
-            )
+            hint = "empty: 20, that of a printed TacTip; all lengths are in proportion to it"
+            self._radius = gui.add_text(CONTROLS["radius_mm"], "", hint=hint)
             page.button("Propose a specification", self.propose)
             correct = gui.add_button_group("correct the layout", (SMALLER, LARGER))
-            self._number = gui.add_slider("frame shown", 0, 1, 1, 0, disabled=True)
+            self._number = page.watch(gui.add_slider("frame shown", 0, 1, 1, 0, disabled=True), self._look_again)
             page.button("Use this sensor", self.use)
         correct.on_click(page.guard(lambda: self.correct(+1 if correct.value == LARGER else -1)))
-        self._number.on_update(page.guard(lambda: self._looking.give(int(self._number.value))))
 
     def show(self) -> None:
         """Show the newest proposal."""
-        if self._made is None:
+        if self._proposed is None:
             self._page.show_nothing(self._absent)
         else:
-            self._looking.give(int(self._number.value))
+            self._look_again()
+
+    def _look_again(self) -> None:
+        self._looking.give(int(self._number.value))
 
     def _take_upload(self, path: str) -> None:
         put(self._frames, path)
@@ -125,9 +92,9 @@ class NewMode(PageMode):
         refusal = TwinError(f"`radius_mm` {quote(radius)}: give a number, or nothing for a printed TacTip's 20")
         with ErrorsAs(ValueError, lambda error: refusal):
             radius_mm = float(radius) if radius else None
-        self._made, self._absent = None, "The frames are being processed."
+        self._proposed, self._absent = None, "The frames are being processed."
         self.show()
-        self._making.give(Wish(frames, no_contact, layout, radius_mm))
+        self._making.give((Path(frames), Path(no_contact) if no_contact else None, layout, radius_mm))
 
     def correct(self, by: int) -> None:
         """Propose again with a layout that is larger or smaller by ``by``.
@@ -135,9 +102,12 @@ class NewMode(PageMode):
         Raises
         ------
         TwinError, SpecError
-            Nothing has been proposed yet, or there is no such layout.
+            Nothing has been proposed yet, the layout is a list of positions, or it would become too small.
         """
-        put(self._layout, enlarge_layout(self._proposal().sensor.pins, by))
+        pins = self._proposal().sensor.pins
+        text = f"{pins.layout}:{pins.shape.resize(by)}"
+        layout_from(text)  # raises an error if there is no such layout
+        put(self._layout, text)
         self.propose()
 
     def use(self) -> None:
@@ -149,41 +119,40 @@ class NewMode(PageMode):
             Nothing has been proposed yet.
         """
         written = str(self._proposal().written[0])
-        self._twin.open(self._twin.state.alter(sensor=written, form="raw", pose={"depth_mm": FIRST_DEPTH_MM}))
+        self._twin.open(self._twin.state.alter(sensor=written, form=Form.RAW, pose={"depth_mm": FIRST_DEPTH_MM}))
         self._page.choose(self._twin.title)
 
     def _proposal(self) -> NewSensor:
-        if self._made is None:
+        if self._proposed is None:
             raise TwinError("nothing has been proposed yet; press 'Propose a specification' first")
-        return self._made
+        return self._proposed[0]
 
     def _make(self, wish: Wish) -> None:
         def report(stage: str, done: float, total: float, note: str = "") -> None:
             share = f", {100 * done / total:.0f} %" if total else ""
             self._page.say(f"processing the frames: {stage}{share}")
 
-        no_contact = Path(wish.no_contact) if wish.no_contact else None
+        frames, no_contact, layout, radius_mm = wish
         out = next_path(self._out, "my-sensor", ".toml")
         try:
-            layout = layout_from(wish.layout) if wish.layout else None
-            made = new_sensor(Path(wish.frames), out, layout=layout, radius_mm=wish.radius_mm, no_contact=no_contact, progress=report)
+            pins = layout_from(layout) if layout else None
+            made = new_sensor(frames, out, layout=pins, radius_mm=radius_mm, no_contact=no_contact, progress=report)
         except (TwinError, SpecError) as error:
             self._absent = f"No specification: {error}"
             self._page.hush()
             if self._active:
                 self.show()
             return
-        recording = open_recording(frames_at(Path(wish.frames), None, no_contact), made.sensor)
-        self._made, self._recording = made, recording
-        self._pipeline = Pipeline(made.sensor, recording.form)
+        recording = open_recording(frames_at(frames, None, no_contact), made.sensor)
+        self._proposed = made, recording, Pipeline(made.sensor, recording.form)
         self._number.max, self._number.disabled = max(1, len(recording) - 1), False
         self._page.say(f"wrote {made.written[0]}, and a page beside it")
         self._looking.give(min(int(self._number.value), len(recording) - 1))
 
     def _look(self, index: int) -> None:
-        made, recording, pipeline = self._made, self._recording, self._pipeline
-        if made is None or recording is None or pipeline is None or not self._active:
+        if (proposed := self._proposed) is None or not self._active:
             return
+        made, recording, pipeline = proposed
         frame = recording.read(int(np.clip(index, 0, len(recording) - 1)))
         seen = pipeline(frame)
         camera = camera_picture(frame, seen, pipeline.reference.pins_px, OverlayChoices.GRAPH)

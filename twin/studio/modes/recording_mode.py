@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from scenes import load_object
-from scenes.experiment import ExperimentSpec
+from scenes.experiment import LABELS, ExperimentSpec
 from twin.errors import ContactError, FrameError, TwinError
 from twin.estimate import Estimate, SensorModel, pins_in, readable_labels
 from twin.frames import Recording, open_recording
@@ -16,11 +16,12 @@ from twin.rig.contact import RigContact
 from twin.rig.labels import ArmLabel, poses_and_moves, read_arm_labels
 from twin.studio.camera import dome_part
 from twin.studio.contact import MovingContact, experiment_of
+from twin.studio.live_page import frame_pictures
 from twin.studio.modes.mode import PageMode
 from twin.studio.modes.twin_mode import TwinMode
-from twin.studio.page import ARCHIVES, CELLS, StudioPage, put
-from twin.studio.pictures import OverlayChoices, badge, camera_picture, cell_picture, estimate_table, number_table, paragraph
-from twin.types import FloatArray, Form, Frame, Observation
+from twin.studio.page import CELLS, StudioPage, put
+from twin.studio.pictures import badge, estimate_table, number_table, paragraph
+from twin.types import Form, Frame, ImageArray, Observation
 
 UNSURE = 0.5
 """Probability below which the model doubts that a move was executed."""
@@ -38,8 +39,6 @@ class Looked:
     estimate : Estimate or None
     label : ArmLabel or None
         None where the recording has no labels.
-    values : dict of str to float
-        The labels' values by the names of the model's estimates.
     doubts : tuple of str
         Reasons to doubt the label.
     """
@@ -49,7 +48,6 @@ class Looked:
     seen: Observation
     estimate: Estimate | None
     label: ArmLabel | None
-    values: dict[str, float]
     doubts: tuple[str, ...]
 
 
@@ -92,19 +90,16 @@ class RecordingView:
 
     def _fitting(self, model: SensorModel | None) -> SensorModel | None:
         """The model for this recording's frames. It uses the recording's no-contact frame if both allow this."""
-        if model is None:
-            self.notes.append("no estimates: there is no model of this sensor")
+        form, rest = self.recording.form, self.recording.reference
+        try:
+            if model is None:
+                raise FrameError("there is no model of this sensor")
+            if model.form != form:
+                raise FrameError(f"the model is for {model.form} frames, these are {form} ones")
+            return model if rest is None or not model.counts_from_rest else model.at_rest(rest)
+        except FrameError as error:
+            self.notes.append(f"no estimates: {error}")
             return None
-        if model.form != self.recording.form:
-            self.notes.append(f"no estimates: the model is for {model.form} frames, these are {self.recording.form} ones")
-            return None
-        if model.counts_from_rest and self.recording.reference is not None:
-            try:
-                return model.at_rest(self.recording.reference)
-            except FrameError as error:
-                self.notes.append(f"no estimates: {error}")
-                return None
-        return model
 
     def look(self, index: int) -> Looked:
         """A frame, what is found in it, and its label.
@@ -118,7 +113,7 @@ class RecordingView:
         estimate = None if self._model is None else self._model(frame)
         seen = pins_in(frame, estimate, self._pipeline)
         label = self._labels[index] if self._labels else None
-        told = {} if label is None else _label_values(label)
+        told = _label_values(label)
         doubts = [] if label is None or label.executed else ["audit: the move was not executed"]
         executed = float(getattr(estimate, "executed", np.nan))
         if label is not None and np.abs(label.move).max() > 0 and executed < UNSURE:
@@ -127,10 +122,10 @@ class RecordingView:
             values = zip(estimate.names, readable_labels(estimate.names), estimate.low, estimate.high, strict=True)
             outside = [title for name, title, low, high in values if name in told and not low <= told[name] <= high]
             doubts += [f"{name} is outside the 90 % interval" for name in outside]
-        return Looked(index, frame, seen, estimate, label, told, tuple(doubts))
+        return Looked(index, frame, seen, estimate, label, tuple(doubts))
 
-    def twin_light(self, looked: Looked) -> FloatArray | None:
-        """The twin's linear light of a frame's labelled contact; None without labels, or without an experiment that defines their axes.
+    def twin_picture(self, looked: Looked) -> ImageArray | None:
+        """The dome's part of the twin's frame of a labelled contact; None without labels, or without an experiment for their axes.
 
         Raises
         ------
@@ -141,24 +136,18 @@ class RecordingView:
             return None
         if self._rig is None:
             self._rig = RigContact(self.contact.solver, self._experiment, load_object(self._experiment.object))
-        return self.contact.camera.draw(self._rig.end(looked.label))
-
-    def twin_frame(self, light: FloatArray) -> Frame:
-        """A processed frame, made from the light of ``twin_light``."""
-        raw = self.contact.camera.raw(light, seed=0)
-        return raw if self.recording.form is Form.RAW else self.contact.camera.as_recorded(raw)
-
-    def crop(self, image: np.ndarray) -> np.ndarray:
-        """The dome's part of a processed picture."""
-        return dome_part(self.contact.setup.sensor, image, self.recording.form)
+        camera = self.contact.camera
+        raw = camera.raw(camera.draw(self._rig.end(looked.label)), seed=0)
+        frame = raw if self.recording.form is Form.RAW else camera.as_recorded(raw)
+        image = dome_part(self.contact.setup.sensor, frame.image, frame.form)
+        return image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
 
 
-def _label_values(label: ArmLabel) -> dict[str, float]:
+def _label_values(label: ArmLabel | None) -> dict[str, float]:
     """A label's values by the tables' names: the arm's real pose and move, which differ from the table's if the move was not executed."""
-    (pose,), (move,) = poses_and_moves([label])
-    return {f"pose_{axis + 1}": float(value) for axis, value in enumerate(pose)} | {
-        f"move_{axis + 1}": float(value) for axis, value in enumerate(move)
-    }
+    if label is None:
+        return {}
+    return dict(zip(LABELS, np.concatenate(poses_and_moves([label]), axis=None).tolist(), strict=True))
 
 
 class RecordingMode(PageMode):
@@ -183,37 +172,37 @@ class RecordingMode(PageMode):
         with self.folder:
             self._path = gui.add_text("folder or video", first, hint="any recording that 'twin preprocess' reads, on the studio's machine")
             page.button("Open", lambda: self.open(self._path.value))
-            page.upload(
-                "Upload frames (zip or video)", ARCHIVES, self._take_upload, hint="or drop a folder, an archive or a video on the page"
-            )
-            self._number = gui.add_slider("frame number", 0, 1, 1, 0, disabled=True)
+            page.upload_frames(self._take_upload)
+            self._number = page.watch(gui.add_slider("frame number", 0, 1, 1, 0, disabled=True), lambda: self._go(int(self._number.value)))
             steps = gui.add_button_group("step", ("-10", "-1", "+1", "+10"))
             page.button("Next doubtful label", lambda: self._wanted.give(-1), hint="the next frame whose label is doubtful")
-            self._against = gui.add_checkbox("the twin's picture beside it", True)
-        self._number.on_update(page.guard(lambda: self._go(int(self._number.value))))
+            self._against = page.watch(gui.add_checkbox("the twin's picture beside it", True), self._show_again)
         steps.on_click(lambda event: self._go(int(self._number.value) + int(event.target.value)))
-        self._against.on_update(lambda event: self._wanted.give(int(self._number.value)))
 
     def show(self) -> None:
         """Show the recording. The recording that the command named is opened now."""
         self._page.show_nothing("Give a recording's folder or video and press 'Open'.")
         if self._view is None and self._first:
-            self.open(self._first)
+            self._page.guard(lambda: self.open(self._first))(self)
         elif self._view is not None and self._view.contact is not self._twin.contact:  # the user has changed the sensor
-            self.open(self._path.value)
-        elif self._view is not None:
-            self._wanted.give(int(self._number.value))
+            self._page.guard(lambda: self.open(self._path.value))(self)
+        else:
+            self._show_again()
+
+    def _show_again(self) -> None:
+        self._wanted.give(int(self._number.value))
 
     def open(self, path: str) -> None:
-        """Show another recording. Errors are shown on the page."""
-        self._page.hush()
-        try:
-            if not path.strip():
-                raise TwinError("give a recording's folder or video first")
-            self._view = RecordingView(path.strip(), self._twin.contact)
-        except TwinError as error:
-            self.complain(str(error))
-            return
+        """Show another recording.
+
+        Raises
+        ------
+        TwinError
+            There is no such recording, or it belongs to another sensor.
+        """
+        if not path.strip():
+            raise TwinError("give a recording's folder or video first")
+        self._view = RecordingView(path.strip(), self._twin.contact)
         self._number.max = max(1, len(self._view) - 1)
         self._number.disabled = False
         self._go(0)
@@ -225,12 +214,12 @@ class RecordingMode(PageMode):
     def _go(self, index: int) -> None:
         if self._view is not None:
             put(self._number, int(np.clip(index, 0, len(self._view) - 1)))
-            self._wanted.give(int(self._number.value))
+            self._show_again()
 
     def follow(self, answer: object) -> None:
         """Show the frame again, with estimates, if the twin has loaded a model since it was opened."""
         if self._view is not None and self._view.given is not self._view.contact.model:
-            self._wanted.give(int(self._number.value))
+            self._show_again()
 
     def _show(self, index: int) -> None:
         view = self._view
@@ -241,19 +230,16 @@ class RecordingMode(PageMode):
         looked = self._next_doubt(view) if index < 0 else view.look(index)
         if looked is None:
             return
-        beside = cell_picture(looked.frame, looked.seen, view.reference.area_px2, view.crop)
-        self._show_frame(view, looked, beside)
+        self._show_frame(view, looked)
         if not self._against.value or looked.label is None or self._wanted.overtaken:
             return
         try:
-            light = view.twin_light(looked)
+            made = view.twin_picture(looked)
         except ContactError as error:
-            self._show_frame(view, looked, beside, note=f"The twin has no picture of this contact: {error}")
+            self._show_frame(view, looked, note=f"The twin has no picture of this contact: {error}")
             return
-        if light is not None and not self._wanted.overtaken:
-            made = view.crop(view.twin_frame(light).image)
-            colour = made if made.ndim == 3 else np.repeat(made[..., None], 3, axis=2)
-            self._show_frame(view, looked, colour, label="the twin's picture of this contact")
+        if made is not None and not self._wanted.overtaken:
+            self._show_frame(view, looked, made)
 
     def _next_doubt(self, view: RecordingView) -> Looked | None:
         """The next frame with a doubtful label, searched after the shown frame and then from the beginning."""
@@ -268,24 +254,25 @@ class RecordingMode(PageMode):
         self._page.say("No label of this recording is doubtful.")
         return None
 
-    def _show_frame(self, view: RecordingView, looked: Looked, beside: np.ndarray, *, label: str = CELLS, note: str = "") -> None:
-        told = looked.label
+    def _show_frame(self, view: RecordingView, looked: Looked, twins: ImageArray | None = None, *, note: str = "") -> None:
+        told, values = looked.label, _label_values(looked.label)
         found = f"{looked.seen.found} of {len(looked.seen.pins_px)}"
         rows = {"frame": f"{looked.frame.name} ({looked.index + 1} of {len(view)})", "pins found": found}
         if told is not None:
             rows |= {"label, pose": _six(told.pose), "label, move": _six(told.move)}
-        camera = view.crop(camera_picture(looked.frame, looked.seen, view.reference.pins_px, OverlayChoices.GRAPH))
+        camera, cells = frame_pictures(view.contact.setup.sensor, view.reference, looked.frame, looked.seen)
+        beside, below = (cells, CELLS) if twins is None else (twins, "the twin's picture of this contact")
         numbers = [
             badge("recorded") + badge(str(view.recording.form)),
             paragraph("; ".join(looked.doubts), "stop"),
             paragraph("" if looked.seen.valid else f"The pipeline refuses the frame: {looked.seen.reason}", "stop"),
             number_table(rows),
-            estimate_table(looked.estimate, looked.values, missing=next((n for n in view.notes if n.startswith("no estimates")), "")),
-            paragraph("The label is used as ground truth." if looked.values else "", "note"),
+            estimate_table(looked.estimate, values, missing=next((n for n in view.notes if n.startswith("no estimates")), "")),
+            paragraph("The label is used as ground truth." if values else "", "note"),
             paragraph(note, "said"),
             *(paragraph(text, "note") for text in [*view.recording.problems, *view.notes][:4]),
         ]
-        self.put_up((camera, beside), f"recorded frame {looked.frame.name}", numbers, below=label)
+        self.put_up((camera, beside), f"recorded frame {looked.frame.name}", numbers, below=below)
 
 
 def _six(values: np.ndarray) -> str:

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import viser
 
-from scenes import list_objects, list_sensors, load_object, load_sensor
+from scenes import list_specifications, load_object, load_sensor
 from scenes.base import SpecError
 from twin.errors import TwinError
 from twin.estimate import SensorModel, readable_labels
@@ -83,7 +83,7 @@ class TwinMode(PageMode):
         self._out, self._model_of, self._traces = out, model_of, traces
         self._state = state
         self._kept: StudioState | None = None  # as it is in the file of the last state
-        self._shown, self._drawn = PinColour(state.colour), OverlayChoices(state.drawn)
+        self._shown, self._drawn = state.colour, state.drawn
         self._wish, self._wished_s = state.object_pose(), 0.0
         self._undo: list[ObjectPose] = []
         self.model_note, self._loading = MODEL_LOADING, False
@@ -98,16 +98,15 @@ class TwinMode(PageMode):
         self._links = self.newest(self._open_link, "link")
         page.on_address = self._links.give
         self._build_controls()
-        self._forces, self._estimates, self._depths = self.charts = tuple(
-            LineChart(page, title) for title in ("force on the object, N", "error of the estimates", "indentation, mm")
-        )
+        titles = "force on the object, N", "error of the estimates", "indentation, mm"
+        self._forces, self._estimates, self._depths = self.charts = tuple(LineChart(page, title) for title in titles)
 
     # start and end
 
     def _prepare(self, state: StudioState) -> tuple[MovingContact, Tracer | None]:
         """The contact of a state and its tracer. The page is not changed."""
         sensor = load_sensor(state.sensor)
-        contact = MovingContact(ContactSetup(sensor, load_object(state.object), state.friction, Form(state.form)))
+        contact = MovingContact(ContactSetup(sensor, load_object(state.object), state.friction, state.form))
         return contact, Tracer(sensor) if self._traces else None
 
     def _take_up(self, contact: MovingContact, tracer: Tracer | None) -> None:
@@ -129,16 +128,16 @@ class TwinMode(PageMode):
 
     def _begin(self) -> None:
         self._loading = False
-        self.worker.__enter__()
+        self.worker.start()
         self.worker.do(self.contact.warm_up)
         self.worker.ask(self._wish)
 
     def stop(self) -> None:
         """End threads and processes."""
         self._end_film()
-        self.worker.__exit__(None, None, None)
+        self.worker.stop()
         if self._tracer is not None:
-            self._tracer.__exit__(None, None, None)
+            self._tracer.close()
         super().stop()
 
     def _load_model(self, name: str) -> None:
@@ -166,13 +165,8 @@ class TwinMode(PageMode):
     @property
     def state(self) -> StudioState:
         """The whole state."""
-        return self._state.alter(
-            friction=self.contact.setup.friction,
-            pose=asdict(self._wish),
-            form=str(self.contact.setup.form),
-            colour=str(self._shown),
-            drawn=str(self._drawn),
-        )
+        setup, pose = self.contact.setup, asdict(self._wish)
+        return self._state.alter(friction=setup.friction, pose=pose, form=setup.form, colour=self._shown, drawn=self._drawn)
 
     # wishes
 
@@ -215,67 +209,57 @@ class TwinMode(PageMode):
     # controls
 
     def _build_controls(self) -> None:
-        gui, guarded, button, setup = self._page.gui, self._page.guard, self._page.button, self.contact.setup
+        page, gui, watch, button = self._page, self._page.gui, self._page.watch, self._page.button
+
+        def choice(label: str, choices: Iterable[str], chosen: str, take: Callable[[], None]) -> viser.GuiDropdownHandle[str]:
+            return watch(gui.add_dropdown(label, tuple(map(str, choices)), initial_value=str(chosen)), take)
+
         with self.folder:
             self._sliders = {}
             for name in NAMES:
                 low, high, why = LIMITS[name]
-                self._sliders[name] = slider = gui.add_slider(
-                    f"{readable_name(name)}, {unit_of(name)}",
-                    low,
-                    high,
-                    0.05,
-                    getattr(self._wish, name),
-                    hint=f"{low:g} to {high:g}: {why}",
-                )
-                slider.on_update(guarded(partial(self._move_to_slider, name)))
+                title, hint = f"{readable_name(name)}, {unit_of(name)}", f"{low:g} to {high:g}: {why}"
+                slider = gui.add_slider(title, low, high, 0.05, getattr(self._wish, name), hint=hint)
+                self._sliders[name] = watch(slider, partial(self._move_to_slider, name))
             with gui.add_folder("Contact"):
-                sensors, objects = (tuple(sorted({*names(), chosen})) for names, chosen in (
-                    (list_sensors, self._state.sensor), (list_objects, self._state.object)))  # fmt: skip
-                self._sensor = gui.add_dropdown("sensor", sensors, initial_value=self._state.sensor)
-                self._object = gui.add_dropdown("object", objects, initial_value=self._state.object)
-                self._page.upload(
-                    "Upload an object (mesh)", ".stl,.obj,.ply", self._touch, hint="lengths in mm; or drop the file on the page"
-                )
-                self._friction = gui.add_slider("friction", 0.0, MOST_FRICTION, 0.01, self._own_friction())
+                sensor, touched = self._state.sensor, self._state.object
+                self._sensor = choice("sensor", sorted({*list_specifications("sensors"), sensor}), sensor, self._change_sensor)
+                self._object = choice("object", sorted({*list_specifications("objects"), touched}), touched, self._change_object)
+                page.upload("Upload an object (mesh)", ".stl,.obj,.ply", self._touch, hint="lengths in mm; or drop the file on the page")
+                self._friction = watch(gui.add_slider("friction", 0.0, MOST_FRICTION, 0.01, self._own_friction()), self._change_friction)
                 button("Restart contact", self.restart_contact, hint="clear the friction history and press straight down")
             with gui.add_folder("Show"):
-                forms = tuple(str(form) for form in Form if form is Form.RAW or setup.sensor.recording is not None)
-                self._form = gui.add_dropdown("frame", forms, initial_value=str(setup.form))
-                self._drawing = gui.add_dropdown("overlay", tuple(map(str, OverlayChoices)), initial_value=str(self._drawn))
-                self._colour = gui.add_dropdown("colour pins by", tuple(map(str, PinColour)), initial_value=str(self._shown))
+                self._form = choice("frame", self._forms(), self.contact.setup.form, self._change_form)
+                self._drawing = choice("overlay", OverlayChoices, self._drawn, self._change_look)
+                self._colour = choice("colour pins by", PinColour, self._shown, self._change_look)
             with gui.add_folder("Move", expand_by_default=False):
                 button("Tap and shear", self.tap_and_shear)
                 upload = gui.add_upload_button("Play trajectory (CSV)", mime_type=".csv", hint="columns time_s, x_mm, y_mm, depth_mm, ...")
-                self._record_way = gui.add_checkbox("record the trajectory", False)
+                self._record_way = watch(gui.add_checkbox("record the trajectory", False), self._toggle_trajectory)
                 button("Undo", self.undo)
             with gui.add_folder("Save", expand_by_default=False):
                 button("Save picture", self.save_picture)
                 button("Save contact files", self.save_contact)
                 button("Save state", self.save_state)
                 opened = gui.add_upload_button("Open a state", mime_type=".json")
-                link = self.state.link(self._page.url)
+                link = self.state.link(page.url)
                 self._link = gui.add_text("link", link, hint="opens this state again; paste another one to open it")
-                self._filming = gui.add_checkbox("record a video", False)
-        self._form.on_update(guarded(self._change_form))
-        self._drawing.on_update(guarded(self._change_look))
-        self._colour.on_update(guarded(self._change_look))
-        self._friction.on_update(guarded(self._change_friction))
-        self._object.on_update(guarded(self._change_object))
-        self._sensor.on_update(guarded(self._change_sensor))
-        upload.on_upload(guarded(lambda: self.play(read_trajectory(upload.value.content, upload.value.name))))
-        opened.on_upload(guarded(lambda: self.open(StudioState.read(opened.value.content, opened.value.name))))
-        self._link.on_update(guarded(lambda: self._links.give(self._link.value)))
-        self._record_way.on_update(guarded(self._toggle_trajectory))
-        self._filming.on_update(guarded(self._toggle_film))
+                self._filming = watch(gui.add_checkbox("record a video", False), self._toggle_film)
+        upload.on_upload(page.guard(lambda: self.play(read_trajectory(upload.value.content, upload.value.name))))
+        opened.on_upload(page.guard(lambda: self.open(StudioState.read(opened.value.content, opened.value.name))))
+        watch(self._link, lambda: self._links.give(self._link.value))
         for modifier, names in CHANGED.items():
             for keys, name in zip(KEYS, names, strict=True):
                 for key, sign in zip(keys, (-1, +1), strict=True):
                     label = f"{readable_name(name)} {'+' if sign > 0 else '-'}{STEPS[unit_of(name)]:g} {unit_of(name)}"
                     command = gui.add_command(label, hotkey=key, modifier=modifier)  # type: ignore[arg-type]  # viser defines it as a literal
-                    command.on_trigger(guarded(partial(self.nudge, name, sign)))
-        gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(guarded(self.undo))
-        gui.add_command("Tap and shear", hotkey="T", modifier="shift").on_trigger(guarded(self.tap_and_shear))
+                    command.on_trigger(page.guard(partial(self.nudge, name, sign)))
+        gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(page.guard(self.undo))
+        gui.add_command("Tap and shear", hotkey="T", modifier="shift").on_trigger(page.guard(self.tap_and_shear))
+
+    def _forms(self) -> tuple[str, ...]:
+        """The forms of the sensor's frames."""
+        return tuple(str(form) for form in Form if form is Form.RAW or self.contact.setup.sensor.recording is not None)
 
     def _move_to_slider(self, name: str) -> None:
         self.ask(replace(self._wish, **{name: float(self._sliders[name].value)}))
@@ -344,7 +328,7 @@ class TwinMode(PageMode):
         chosen = self._sensor.value
         with self._rebuilding:
             try:
-                self.open(self.state.alter(sensor=chosen, form=str(Form.RAW)), as_deep=True)
+                self.open(self.state.alter(sensor=chosen, form=Form.RAW), as_deep=True)
             except (TwinError, SpecError):
                 put(self._sensor, self._state.sensor, send=True)
                 raise
@@ -366,18 +350,17 @@ class TwinMode(PageMode):
         with self._rebuilding:
             self._page.say(f"opening {state.sensor} against {state.object} ...")
             prepared = self._prepare(state)
-            self.worker.__exit__(None, None, None)
+            self.worker.stop()
             if self._tracer is not None:
-                self._tracer.__exit__(None, None, None)
+                self._tracer.close()
             self._page.gui.set_panel_label(heading(state))
             before, friction = self._choices(), self._own_friction()
             self._state, wish = state, self._wish
             self._wish = _as_deep(wish, self.contact.touch_mm(wish), prepared[0]) if as_deep else state.object_pose()
-            self._shown, self._drawn = PinColour(state.colour), OverlayChoices(state.drawn)
+            self._shown, self._drawn = state.colour, state.drawn
             self.model_note = MODEL_LOADING
             self._take_up(*prepared)
-            setup = self.contact.setup
-            self._form.options = tuple(str(form) for form in Form if form is Form.RAW or setup.sensor.recording is not None)
+            self._form.options = self._forms()
             for control, name in ((self._sensor, state.sensor), (self._object, state.object)):
                 control.options = tuple(sorted({*control.options, name}))
             for (control, old), (_, new) in zip(before, self._choices(), strict=True):
@@ -394,9 +377,8 @@ class TwinMode(PageMode):
 
     def _open_link(self, link: str) -> None:
         """Show the state of a link, unless the page shows it already."""
-        if link.partition("?")[2] == self.state.link().partition("?")[2]:
-            return
-        self.open(StudioState.of_link(link))
+        if link.partition("?")[2] != self.state.link().partition("?")[2]:
+            self.open(StudioState.of_link(link))
 
     # answers
 
@@ -467,7 +449,8 @@ class TwinMode(PageMode):
     def _numbers(self, answer: ContactAnswer) -> list[str]:
         state, seen = answer.state, answer.seen
         moving = "moving" if not answer.arrived else "still"
-        mesh = str(answer.mesh) if len(state.contact_mm) else "no contact"
+        touched, untouched = len(state.contact_mm) > 0, paragraph("No contact, therefore no estimate.", "note")
+        mesh = answer.mesh if touched else "no contact"
         force, torque = np.round(state.force_n, 2) + 0.0, round(float(state.torque_nmm[2]), 1) + 0.0
         across, into = float(np.hypot(*state.force_n[:2])), float(state.force_n[2])
         ends = force_interval(state.force_n.tolist(), self.contact.setup.sensor.skin.stiffness_factor)
@@ -486,9 +469,7 @@ class TwinMode(PageMode):
             badge(moving, moving) + badge(answer.lit, "still" if answer.lit is Light.TRACED else "") + badge(mesh),
             paragraph(answer.stopped, "stop"),
             number_table(rows),
-            estimate_table(answer.estimate, answer.labels, missing=self.model_note)
-            if len(state.contact_mm)
-            else paragraph("No contact, therefore no estimate.", "note"),
+            estimate_table(answer.estimate, answer.labels, missing=self.model_note) if touched else untouched,
             paragraph(self.contact.fine_lost, "note"),
             paragraph(f"pins coloured by {self._shown}: dark 0, bright {full:g} {unit}; {sum(answer.ms.values()):.0f} ms latency", "note"),
         ]
@@ -542,10 +523,9 @@ class TwinMode(PageMode):
             self._page.say(f"saved {save_trajectory(next_path(self._out, 'trajectory', '.csv'), kept)} (poses: {len(kept)})")
 
     def _toggle_film(self) -> None:
+        self._end_film()
         if self._filming.value:
             self._film = FilmWriter(next_path(self._out, "video", ".mp4"))
-        else:
-            self._end_film()
 
     def _end_film(self) -> None:
         film, self._film = self._film, None

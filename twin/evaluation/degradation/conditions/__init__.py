@@ -6,9 +6,9 @@ from scenes.files import quote
 from scenes.plugins import others
 from twin.errors import TwinError
 from twin.evaluation.degradation.condition import Condition
-from twin.evaluation.degradation.conditions import electronics, gel, lighting, optics, picture, placement, settings, skin
+from twin.evaluation.degradation.conditions import body, electronics, optics, placement
 
-FAMILIES = (lighting, optics, gel, skin, placement, picture, electronics, settings)
+FAMILIES = (optics, body, placement, electronics)
 CONDITIONS: dict[str, Condition] = {c.name: c for family in FAMILIES for c in family.CONDITIONS}
 CONDITIONS |= {c.name: c for c in others("conditions", CONDITIONS, is_one=lambda part: isinstance(part, Condition)).values()}
 

@@ -1,4 +1,4 @@
-"""Degradations of the camera's chip, the stream and the recorder."""
+"""Degradations of the camera's chip, the stream and the recorder, and wrong settings: the camera's window, the pipeline's threshold."""
 
 import cv2
 import numpy as np
@@ -6,6 +6,7 @@ import numpy as np
 from scenes.sensor import ResponseSpec
 from twin.camera.capture import compressed
 from twin.evaluation.degradation.condition import OnSection, PictureView, choose_share, in_family
+from twin.pins import DetectorSpec
 
 
 def darker(response: ResponseSpec, value: float, rng: np.random.Generator) -> ResponseSpec:
@@ -55,14 +56,51 @@ def posterised(image: np.ndarray, value: float, view: PictureView, rng: np.rando
     return np.clip(np.floor(image / step) * step, 0, 255).astype(np.uint8)
 
 
-_condition = in_family("electronics", image_level=True)
+def offset_px(value: float, view: PictureView) -> tuple[int, int]:
+    """Displacement (x, y) in whole px by a share of the disc's radius."""
+    by = value * view.radius_px
+    return round(0.8 * by), round(-0.6 * by)
+
+
+def wrong_crop(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
+    """The camera's window is at another place: the picture is displaced, and black outside of the original window."""
+    dx, dy = offset_px(value, view)
+    if not (dx or dy):
+        return image
+    height, width = image.shape[:2]
+    out = np.zeros_like(image)
+    out[max(dy, 0) : height + min(dy, 0), max(dx, 0) : width + min(dx, 0)] = image[
+        max(-dy, 0) : height + min(-dy, 0), max(-dx, 0) : width + min(-dx, 0)
+    ]
+    return out
+
+
+def displaced(px: np.ndarray, value: float, view: PictureView) -> np.ndarray:
+    """Places in a wrongly cropped picture."""
+    return px + np.array(offset_px(value, view))
+
+
+def too_strict(detector: DetectorSpec, value: float) -> DetectorSpec:
+    """A threshold that misses pins."""
+    return detector.stricter(value)
+
+
+def too_lax(detector: DetectorSpec, value: float) -> DetectorSpec:
+    """A threshold that takes other things for pins."""
+    return detector.stricter(-value)
+
+
+_electronics, _settings = in_family("electronics", image_level=True), in_family("settings", image_level=True)
 CONDITIONS = (
-    _condition("exposure-low", "exposure or gain too low", "light lost", "stops", 9.0, spec=OnSection("response", darker)),
-    _condition("exposure-high", "exposure or gain too high", "light gained", "stops", 9.0, spec=OnSection("response", brighter)),
-    _condition("noise", "sensor noise", "sd of the light, in saturations", "", 0.4, spec=OnSection("response", noisier)),
-    _condition("jpeg", "JPEG compression", "100 less the quality", "", 99.0, frame=jpeg),
-    _condition("resolution", "low resolution", "pixels merged, each way", "px", 9.0, 1.0, frame=coarser),
-    _condition("rows-dropped", "dropped rows", "share of the rows", "", 0.9, frame=rows_lost),
-    _condition("hot-pixels", "hot pixels", "share of the pixels", "", 0.1, frame=hot),
-    _condition("posterised", "posterised levels", "bits lost", "bit", 7.5, frame=posterised),
+    _electronics("exposure-low", "exposure or gain too low", "light lost", "stops", 9.0, spec=OnSection("response", darker)),
+    _electronics("exposure-high", "exposure or gain too high", "light gained", "stops", 9.0, spec=OnSection("response", brighter)),
+    _electronics("noise", "sensor noise", "sd of the light, in saturations", "", 0.4, spec=OnSection("response", noisier)),
+    _electronics("jpeg", "JPEG compression", "100 less the quality", "", 99.0, frame=jpeg),
+    _electronics("resolution", "low resolution", "pixels merged, each way", "px", 9.0, 1.0, frame=coarser),
+    _electronics("rows-dropped", "dropped rows", "share of the rows", "", 0.9, frame=rows_lost),
+    _electronics("hot-pixels", "hot pixels", "share of the pixels", "", 0.1, frame=hot),
+    _electronics("posterised", "posterised levels", "bits lost", "bit", 7.5, frame=posterised),
+    _settings("wrong-crop", "wrong crop", "displacement, of the disc's radius", "", 0.9, frame=wrong_crop, moves=displaced),
+    _settings("threshold-strict", "threshold too strict", "gray levels", "", 120.0, setting=too_strict),
+    _settings("threshold-lax", "threshold too lax", "gray levels", "", 60.0, setting=too_lax),
 )

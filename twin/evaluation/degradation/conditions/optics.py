@@ -1,10 +1,15 @@
-"""Degradations between window and camera chip: focus, motion, dirt, scratches."""
+"""Degradations of the light: LEDs, light from outside, and what lies between window and camera chip: focus, motion, dirt, scratches."""
 
 import cv2
 import numpy as np
 
-from twin.evaluation.degradation.condition import PictureView, in_family, over_channels
+from scenes.sensor import LedRingSpec
+from twin.evaluation.degradation.condition import OnSection, PictureView, in_family, over_channels
 
+# Light in the middle of a glare, in saturations. It is large, so that the camera is saturated far beyond the glare's half width.
+GLARE = 3.0
+# Place of the glare's middle: x and y from the disc's centre, in units of the disc's radius.
+GLARE_AT = (0.35, -0.25)
 # Number of sub-pixels of a pixel along each axis, over which the kernel of a blur is averaged.
 SUBPIXELS = 8
 # Direction of the motion in the picture, deg from x towards y.
@@ -21,6 +26,40 @@ SCRATCH_WIDTH_MM, SCRATCH_LIGHT = 0.12, 0.25
 MOST_SCRATCHES = 1000
 # Number of blurs between which a focus that varies over the picture is interpolated.
 FOCUS_STEPS = 6
+
+
+def dimmed(leds: LedRingSpec, value: float, rng: np.random.Generator) -> LedRingSpec:
+    """All LEDs weaker."""
+    return leds.alter(power=leds.power * (1 - value))
+
+
+def dead(leds: LedRingSpec, value: float, rng: np.random.Generator) -> LedRingSpec:
+    """Lit LEDs go out one after the other around the ring."""
+    balance = np.array(leds.balance or (1.0,) * len(leds.azimuth_deg))
+    lit = np.setdiff1d(np.arange(len(balance)), leds.off)
+    balance[lit] *= np.clip(1 - (value * len(lit) - np.arange(len(lit))), 0, 1)
+    return leds.alter(balance=tuple(balance.tolist()))
+
+
+def reddened(leds: LedRingSpec, value: float, rng: np.random.Generator) -> LedRingSpec:
+    """LEDs that have changed their colour."""
+    red, green, blue = leds.color
+    return leds.alter(color=(red, green * (1 - value), blue * (1 - value)))
+
+
+def room_light(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
+    """Additional light over the whole frame, which increases from one side of the disc to the other."""
+    x, y = view.grid(light.shape)
+    ramp = np.clip(0.5 + 0.5 * (0.8 * x + 0.6 * y), 0, 1)
+    return light + over_channels(value * view.saturation * ramp, light)
+
+
+def glare(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
+    """The reflection of a lamp: uniform in the middle, with a steep edge."""
+    x, y = view.grid(light.shape)
+    radius = 0.5 * value * view.px_per_mm / view.radius_px
+    away2 = ((x - GLARE_AT[0]) ** 2 + (y - GLARE_AT[1]) ** 2) / radius**2
+    return light + over_channels(GLARE * view.saturation * np.exp(-np.log(GLARE) * away2**2), light)
 
 
 def blurred_by(light: np.ndarray, kernel: np.ndarray) -> np.ndarray:
@@ -98,11 +137,16 @@ def scratched(light: np.ndarray, value: float, view: PictureView, rng: np.random
     return light + over_channels(added, light)
 
 
-_condition = in_family("optics", image_level=True)
+_light, _optics = in_family("light"), in_family("optics", image_level=True)
 CONDITIONS = (
-    _condition("defocus", "camera out of focus", "circle of confusion at the caps", "mm", 4.0, light=defocus),
-    _condition("focus-rolled", "focus rolled off to one side", "circle of confusion at the far rim", "mm", 6.0, light=rolled_focus),
-    _condition("motion-blur", "motion blur", "path of the picture during the exposure", "mm", 5.0, light=motion),
-    _condition("lens-dirt", "dirt on the lens", "share of the disc under smudges", "", 0.9, light=dirt),
-    _condition("lens-scratches", "scratched lens", "scratches", "", 120.0, light=scratched),
+    _light("leds-dim", "LEDs grown dim", "share of the LEDs' light lost", "", 0.995, spec=OnSection("leds", dimmed)),
+    _light("leds-dead", "LEDs dead, one after the other", "share of the LEDs", "", 1.0, spec=OnSection("leds", dead)),
+    _light("leds-red", "LED colour shifted to red", "share of green and blue lost", "", 0.995, spec=OnSection("leds", reddened)),
+    _light("room-light", "room light leaking in", "light at the bright side, in saturations", "", 1.5, light=room_light, image_level=True),
+    _light("glare", "saturated glare", "diameter at the caps", "mm", 16.0, light=glare, image_level=True),
+    _optics("defocus", "camera out of focus", "circle of confusion at the caps", "mm", 4.0, light=defocus),
+    _optics("focus-rolled", "focus rolled off to one side", "circle of confusion at the far rim", "mm", 6.0, light=rolled_focus),
+    _optics("motion-blur", "motion blur", "path of the picture during the exposure", "mm", 5.0, light=motion),
+    _optics("lens-dirt", "dirt on the lens", "share of the disc under smudges", "", 0.9, light=dirt),
+    _optics("lens-scratches", "scratched lens", "scratches", "", 120.0, light=scratched),
 )

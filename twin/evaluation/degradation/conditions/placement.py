@@ -1,4 +1,7 @@
-"""Degradations by the camera's place and lens."""
+"""Degradations by the camera's place and lens, by a stream that lost its place, and by a camera that was mounted otherwise."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -9,6 +12,8 @@ from twin.evaluation.degradation.condition import OnSection, PictureView, in_fam
 
 # Direction of a shift in the picture: unit vector at 30 deg from x towards y.
 AWAY = (np.cos(np.radians(30.0)), np.sin(np.radians(30.0)))
+FARTHEST_PX = 64.0
+"""Most severe displacement of rows, px."""
 
 
 def shifted(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
@@ -38,66 +43,87 @@ def vignetted(camera: CameraSpec, value: float, rng: np.random.Generator) -> Cam
     return camera.alter(vignetting=camera.vignetting + value * (1 - camera.vignetting))
 
 
+@dataclass(frozen=True)
+class Warp:
+    """A picture whose pixels are moved by a map (2, 3) of a value and a view. Beyond the border the last row or column is repeated."""
+
+    matrix: Callable[[float, PictureView], np.ndarray]
+
+    def picture(self, light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
+        """The moved picture (H, W[, 3])."""
+        size_px = light.shape[1::-1]
+        return cv2.warpAffine(light, self.matrix(value, view), size_px, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+    def points(self, px: np.ndarray, value: float, view: PictureView) -> np.ndarray:
+        """Positions (n, 2) in it."""
+        matrix = self.matrix(value, view)
+        return px @ matrix[:, :2].T + matrix[:, 2]
+
+
 def roll(degrees: float, view: PictureView) -> np.ndarray:
-    """Map (2, 3) of pixels for a camera that is rotated about its axis."""
+    """Map of pixels for a camera that is rotated about its axis."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     turn, about = np.array([[c, -s], [s, c]]), np.array([view.spec.camera.cx_px, view.spec.camera.cy_px])
     return np.column_stack([turn, about - turn @ about])
 
 
-def skew(rise: float, view: PictureView) -> np.ndarray:
-    """Map (2, 3) of pixels for a rolling shutter: the shift of a row is proportional to its distance from the disc's centre."""
+def skew(value: float, view: PictureView) -> np.ndarray:
+    """Map of pixels for rows that are exposed one after the other while the camera moves: a row is shifted by its height in the disc."""
+    rise = 0.5 * value * view.px_per_mm / view.radius_px
     return np.array([[1.0, rise, -rise * view.center_px[1]], [0.0, 1.0, 0.0]])
 
 
-def warped(light: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Light (H, W[, 3]) with its pixels moved by a map (2, 3). Beyond the border the last row or column is repeated."""
-    return cv2.warpAffine(light, matrix, light.shape[1::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+def turn(degrees: float, view: PictureView) -> np.ndarray:
+    """Map of pixels for a picture that is turned about its middle."""
+    width, height = view.size_px
+    return cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), -degrees, 1.0)
 
 
-def mapped(px: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Positions (n, 2) that a map (2, 3) of pixels moves to."""
-    return px @ matrix[:, :2].T + matrix[:, 2]
-
-
-def rolled(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
-    """A camera that is rotated about its axis."""
-    return warped(light, roll(value, view))
+def rolled(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
+    """A picture that begins at the wrong column; what leaves at the right comes back at the left."""
+    return np.roll(image, round(value), axis=1)
 
 
 def rolled_points(px: np.ndarray, value: float, view: PictureView) -> np.ndarray:
-    """Positions in the picture of a rolled camera."""
-    return mapped(px, roll(value, view))
+    """Positions in a rolled picture."""
+    return px + [round(value), 0]
 
 
-def sheared(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
-    """Rows that are exposed one after the other while the camera moves."""
-    return warped(light, skew(0.5 * value * view.px_per_mm / view.radius_px, view))
+def torn(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
+    """A picture whose lower half is rolled."""
+    middle = len(image) // 2
+    return np.concatenate([image[:middle], rolled(image[middle:], value, view, rng)])
 
 
-def sheared_points(px: np.ndarray, value: float, view: PictureView) -> np.ndarray:
-    """Positions in a sheared picture."""
-    return mapped(px, skew(0.5 * value * view.px_per_mm / view.radius_px, view))
+def torn_points(px: np.ndarray, value: float, view: PictureView) -> np.ndarray:
+    """Positions in a torn picture."""
+    return px + np.where(px[:, 1:] >= int(view.size_px[1]) // 2, [round(value), 0.0], 0.0)
 
 
-_condition = in_family("camera")
+def mirrored(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
+    """A picture with left and right exchanged."""
+    return np.ascontiguousarray(image[:, ::-1])
+
+
+def mirrored_points(px: np.ndarray, value: float, view: PictureView) -> np.ndarray:
+    """Positions in a mirrored picture."""
+    return np.column_stack([view.size_px[0] - 1 - px[:, 0], px[:, 1]])
+
+
+ROLL, SKEW, TURN = Warp(roll), Warp(skew), Warp(turn)
+_camera, _on_frames, _picture = in_family("camera"), in_family("camera", image_level=True), in_family("picture", image_level=True)
 CONDITIONS = (
-    _condition("camera-shifted", "camera shifted", "shift at the caps", "mm", 16.0, spec=shifted),
-    _condition("camera-rolled", "camera rotated", "angle", "deg", 60.0, light=rolled, moves=rolled_points, image_level=True),
-    _condition("camera-tilted", "camera tilted", "angle", "deg", 24.0, spec=OnSection("camera", tilted)),
-    _condition("camera-zoomed", "camera zoomed in", "growth of the picture", "", 0.4, spec=OnSection("camera", zoomed)),
-    _condition("camera-distorted", "another camera's distortion", "rim drawn in, of its radius", "", 0.3, spec=distorted),
-    _condition(
-        "vignetting", "vignetting", "share of light lost at the corners", "", 1.0, spec=OnSection("camera", vignetted), image_level=True
+    _camera("camera-shifted", "camera shifted", "shift at the caps", "mm", 16.0, spec=shifted),
+    _on_frames("camera-rolled", "camera rotated", "angle", "deg", 60.0, light=ROLL.picture, moves=ROLL.points),
+    _camera("camera-tilted", "camera tilted", "angle", "deg", 24.0, spec=OnSection("camera", tilted)),
+    _camera("camera-zoomed", "camera zoomed in", "growth of the picture", "", 0.4, spec=OnSection("camera", zoomed)),
+    _camera("camera-distorted", "another camera's distortion", "rim drawn in, of its radius", "", 0.3, spec=distorted),
+    _on_frames("vignetting", "vignetting", "share of light lost at the corners", "", 1.0, spec=OnSection("camera", vignetted)),
+    _on_frames(
+        "rolling-shutter", "rolling shutter in motion", "motion over the disc's height", "mm", 24.0, light=SKEW.picture, moves=SKEW.points
     ),
-    _condition(
-        "rolling-shutter",
-        "rolling shutter in motion",
-        "motion over the disc's height",
-        "mm",
-        24.0,
-        light=sheared,
-        moves=sheared_points,
-        image_level=True,
-    ),
+    _picture("picture-rolled", "rolled picture", "columns", "px", FARTHEST_PX, frame=rolled, moves=rolled_points),
+    _picture("picture-torn", "torn picture", "columns of the lower half", "px", FARTHEST_PX, frame=torn, moves=torn_points),
+    _picture("picture-turned", "turned picture", "angle", "deg", 180.0, frame=TURN.picture, moves=TURN.points),
+    _picture("picture-mirrored", "mirrored picture", "mirrored", "", 1.0, frame=mirrored, moves=mirrored_points),
 )

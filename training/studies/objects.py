@@ -98,17 +98,8 @@ class ObjectsPlan:
         return learnt + tests
 
     def _config(self, obj: ObjectSpec, experiment: ExperimentSpec, apart: int) -> GenerationConfig:
-        return GenerationConfig(
-            sensor=self.sensor,
-            object=obj,
-            experiment=experiment,
-            randomisation=self.randomisation,
-            friction=obj.friction,
-            seed=self.seed + apart,
-            images="none",
-            states="all",
-            across=self.across,
-        )
+        parts: dict[str, Any] = {"sensor": self.sensor, "object": obj, "experiment": experiment, "randomisation": self.randomisation}
+        return GenerationConfig(**parts, friction=obj.friction, seed=self.seed + apart, images="none", states="all", across=self.across)
 
     def trained_on(self, sets: dict[str, Dataset]) -> dict[str, Dataset]:
         """The data set that each model is trained on, by the model's name. Both have the same number of contacts."""
@@ -159,8 +150,12 @@ def run(plan: ObjectsPlan, out: Path, *, progress: Progress = silent) -> Objects
     TrainingError
         A folder holds another run, or no contact of an object lies within the ranges that are evaluated.
     """
-    sets = {folder: _simulate(plan, out / folder, folder, config, count, progress) for folder, config, count in plan.sets()}
-    runs = {}
+    sets, runs = {}, {}
+    for folder, config, count in plan.sets():
+        with stage(progress, folder) as step:
+            generate(out / folder, config, count, workers=plan.workers, progress=step)
+        with stage(progress, f"{folder}: states") as step:
+            sets[folder] = load_dataset(out / folder, plan.sensor, plan.experiment.targets, progress=step)
     for name, data in plan.trained_on(sets).items():
         runs[name] = out / name
         with stage(progress, name) as step:
@@ -169,13 +164,6 @@ def run(plan: ObjectsPlan, out: Path, *, progress: Progress = silent) -> Objects
     said = verdicts(plan, rows, names)
     page = write_page(out, plan, rows, said)
     return ObjectsResult(rows, said, names, [write_table(out / "objects.csv", rows), page])
-
-
-def _simulate(plan: ObjectsPlan, folder: Path, title: str, config: GenerationConfig, count: int, progress: Progress) -> Dataset:
-    with stage(progress, title) as step:
-        generate(folder, config, count, workers=plan.workers, progress=step)
-    with stage(progress, f"{title}: states") as step:
-        return load_dataset(folder, plan.sensor, plan.experiment.targets, progress=step)
 
 
 def rows_in_range(data: Dataset, experiment: ExperimentSpec) -> np.ndarray:
@@ -218,9 +206,8 @@ def verdicts(plan: ObjectsPlan, rows: list[dict[str, Any]], names: tuple[str, ..
             continue
         held = all(row[f"{name}_times"] <= TIMES for name in names)
         said = ", ".join(f"{label} {row[f'{name}_times']:.2f}" for name, label in zip(names, readable_labels(names), strict=True))
-        lines.append(
-            f"{row['object']}, unseen: {said} times the error on {plan.alone.name} ({'within' if held else 'not within'} {TIMES:g})"
-        )
+        within = f"{'within' if held else 'not within'} {TIMES:g}"
+        lines.append(f"{row['object']}, unseen: {said} times the error on {plan.alone.name} ({within})")
     return lines
 
 
@@ -239,20 +226,16 @@ def write_page(folder: Path, plan: ObjectsPlan, rows: Sequence[Mapping], verdict
     limits = ", ".join(f"{label} {number(ranges[name][0])} to {number(ranges[name][1])} {unit_of(name)}".rstrip() for name, label in labels)
     page = Page(f"Unseen objects: {plan.sensor.name}", "twin study objects", topic="TacTip twin: study")
     page.lead = (
-        f"Two models from {number(plan.count * len(plan.train))} simulated contacts each, evaluated on "
-        f"{number(plan.tests)} other contacts of "
-        "every object, seen or not."
+        f"Two models from {number(plan.count * len(plan.train))} simulated contacts each, evaluated on {number(plan.tests)} other contacts "
+        "of every object, seen or not."
     )
     page.notice("Unseen objects", verdicts)
     chart = write_chart(folder / "errors.png", lambda: errors_figure(rows, names, alone))
-    page.figures(
-        PagePicture(
-            chart,
-            f"Errors of both models on every object, as multiples of their error on {alone}",
-            f"Mean absolute error of each label, as a multiple of the same model's error on {alone} (dashed). Filled: the object was "
-            f"trained on; open: unseen. Dotted: the target, {TIMES:g} times.",
-        )
+    caption = (
+        f"Mean absolute error of each label, as a multiple of the same model's error on {alone} (dashed). Filled: the object was trained "
+        f"on; open: unseen. Dotted: the target, {TIMES:g} times."
     )
+    page.figures(PagePicture(chart, f"Errors of both models on every object, as multiples of their error on {alone}", caption))
     page.section("Errors")
     page.table(
         [{**row, "seen": "yes" if row["seen"] else "no"} for row in rows],

@@ -1,15 +1,31 @@
-"""Degradations of skin and caps."""
+"""Degradations of gel, skin and caps."""
 
 import cv2
 import numpy as np
 
 from scenes.base import Rgb
-from scenes.body import SkinSpec
-from scenes.sensor import AppearanceSpec, SensorSpec
+from scenes.body import GelSpec, SkinSpec
+from scenes.sensor import AppearanceSpec, SensorSpec, SpeckSpec
 from twin.evaluation.degradation.condition import OnSection, PictureView, choose_share, in_family, over_channels
 from twin.geometry.pins import rest_pins
 from twin.optics.surfaces import cap_albedo
 
+# Smallest and largest radius of a bubble, mm. Chosen.
+BUBBLE_RADIUS_MM = (0.15, 0.6)
+# Share of the radius of the housing's opening within which bubbles are.
+BUBBLE_REACH = 0.9
+# Share of a cap's light that a bubble reflects into the camera. Chosen.
+BUBBLE_LIGHT = 0.6
+# Share of the light behind it that a bubble hides. Chosen.
+BUBBLE_OPACITY = 0.5
+# Number of bubbles whose random numbers are drawn at once, so that the first bubbles have the same places for any number.
+MOST_BUBBLES = 1000
+# Linear light of a cap at mid gray, as a share of saturation.
+CAP_LIGHT = 0.25
+# Absorption of aged silicone in red, green and blue, relative to blue. Chosen.
+YELLOW = (0.25, 0.5, 1.0)
+# Share of the light that is scattered forward at severity 1.
+MOST_HAZE = 1.0
 # Reflectance of a cap that has come off, relative to an intact one. It is not 0, because levels must be positive.
 GONE = 1e-6
 # Outline of a broken cap, in the form of ``appearance.cap_shapes``: about a third of the area is left, on one side. Chosen.
@@ -23,6 +39,36 @@ TEAR_AT = (-0.3, 0.35)
 TEAR_LIGHT = 0.7
 # Least cosine of a cap's tilt that is used for drawing, because a cap with a larger tilt would vanish.
 LEAST_FACING = 0.3
+
+
+def bubbles(spec: SensorSpec, value: float, rng: np.random.Generator) -> SensorSpec:
+    """Bubbles at the window, which are added one after the other. A fraction of a bubble is a fainter bubble."""
+    count = int(np.ceil(value))
+    turn = rng.uniform(0, 2 * np.pi, MOST_BUBBLES)[:count]
+    rho_mm = np.sqrt(rng.uniform(0, 1, MOST_BUBBLES))[:count] * spec.housing.aperture_radius_mm * BUBBLE_REACH
+    radius_mm, part = rng.uniform(*BUBBLE_RADIUS_MM, MOST_BUBBLES)[:count], np.minimum(value - np.arange(count), 1)
+    light = BUBBLE_LIGHT * (CAP_LIGHT / spec.response.exposure)
+    new = [
+        SpeckSpec(x_mm=r * np.cos(t), y_mm=r * np.sin(t), radius_mm=size, opacity=BUBBLE_OPACITY * p, light=light * p)
+        for t, r, size, p in zip(turn.tolist(), rho_mm.tolist(), radius_mm.tolist(), part.tolist(), strict=True)
+    ]
+    return spec.alter(appearance={"specks": (*spec.appearance.specks, *new)})
+
+
+def hazy(gel: GelSpec, value: float, rng: np.random.Generator) -> GelSpec:
+    """Gel that scatters more light."""
+    return gel.alter(haze=gel.haze + value * (MOST_HAZE - gel.haze))
+
+
+def yellowed(gel: GelSpec, value: float, rng: np.random.Generator) -> GelSpec:
+    """Gel that absorbs blue."""
+    old = gel.absorption_per_mm
+    return gel.alter(absorption_per_mm=tuple(a + value * share for a, share in zip(old, YELLOW, strict=True)))
+
+
+def softened(gel: GelSpec, value: float, rng: np.random.Generator) -> GelSpec:
+    """Gel that has lost stiffness."""
+    return gel.alter(young_modulus_mpa=gel.young_modulus_mpa * (1 - value))
 
 
 def cap_levels(appearance: AppearanceSpec, count: int) -> np.ndarray:
@@ -120,14 +166,18 @@ def cap_cover(shape: tuple[int, ...], view: PictureView) -> np.ndarray:
     return cover / np.float32(255)
 
 
-_condition = in_family("skin")
+_gel, _skin = in_family("gel"), in_family("skin")
 CONDITIONS = (
-    _condition("caps-missing", "caps come off", "share of the caps", "", 0.6, spec=missing, hides=those_missing),
-    _condition("caps-broken", "broken caps", "share of the caps", "", 1.0, spec=broken),
-    _condition("caps-faded", "faded caps", "share of their reflectance lost", "", 0.995, spec=OnSection("appearance", faded)),
-    _condition("caps-uneven", "unevenly soiled caps", "sd of the logarithm of their reflectance", "", 4.0, spec=uneven),
-    _condition("skin-pale", "skin worn pale", "reflectance gained", "", 0.6, spec=OnSection("appearance", pale)),
-    _condition("skin-translucent", "translucent skin", "room light through it, in saturations", "", 0.8, light=translucent),
-    _condition("skin-torn", "torn skin", "diameter of the hole", "mm", 22.0, light=torn, hides=those_torn_off),
-    _condition("skin-swollen", "skin swollen by oil", "growth", "", 0.2, spec=OnSection("skin", swollen), solves=True),
+    _gel("gel-bubbles", "bubbles in the gel", "bubbles", "", 200.0, spec=bubbles),
+    _gel("gel-haze", "hazy gel", "share of the light scattered forward", "", 1.0, spec=OnSection("gel", hazy)),
+    _gel("gel-yellow", "yellowed gel", "absorption of blue", "1/mm", 0.6, spec=OnSection("gel", yellowed)),
+    _gel("gel-soft", "gel softened by temperature", "share of its stiffness lost", "", 0.9, spec=OnSection("gel", softened), solves=True),
+    _skin("caps-missing", "caps come off", "share of the caps", "", 0.6, spec=missing, hides=those_missing),
+    _skin("caps-broken", "broken caps", "share of the caps", "", 1.0, spec=broken),
+    _skin("caps-faded", "faded caps", "share of their reflectance lost", "", 0.995, spec=OnSection("appearance", faded)),
+    _skin("caps-uneven", "unevenly soiled caps", "sd of the logarithm of their reflectance", "", 4.0, spec=uneven),
+    _skin("skin-pale", "skin worn pale", "reflectance gained", "", 0.6, spec=OnSection("appearance", pale)),
+    _skin("skin-translucent", "translucent skin", "room light through it, in saturations", "", 0.8, light=translucent),
+    _skin("skin-torn", "torn skin", "diameter of the hole", "mm", 22.0, light=torn, hides=those_torn_off),
+    _skin("skin-swollen", "skin swollen by oil", "growth", "", 0.2, spec=OnSection("skin", swollen), solves=True),
 )

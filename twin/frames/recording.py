@@ -154,10 +154,8 @@ class Recording:
             if isinstance(image, str):
                 yield index, image.removeprefix(f"{self.names[index]}: ")
             elif (got := image.shape[1::-1]) != expected:
-                yield (
-                    index,
-                    f"expected {times(expected)} as the recording's other frames, got {times(got)}; leave it out or record it again",
-                )
+                unlike = f"expected {times(expected)} as the recording's other frames, got {times(got)}"
+                yield index, f"{unlike}; leave it out or record it again"
             else:
                 yield index, Frame(image, self.form, self.names[index], time_s, index)
 

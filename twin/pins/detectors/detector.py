@@ -240,12 +240,12 @@ def _scale_space(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tupl
     small, large = (radius / np.sqrt(2) for radius in detector.radius_px)
     inside = mask.disc > 0
     image = np.where(inside, window, np.median(window[inside])) / LEVELS
-    find, options = {
-        "log": (blob_log, {"num_sigma": LOG_STEPS, "threshold": LOG_PEAK * contrast}),
-        "dog": (blob_dog, {"sigma_ratio": DOG_RATIO, "threshold": LOG_PEAK * contrast}),
-        "doh": (blob_doh, {"num_sigma": LOG_STEPS, "threshold": DOH_PEAK * contrast**2}),
-    }[detector.method]
-    found = find(image, min_sigma=small, max_sigma=large, overlap=OVERLAP, **options)
+    if detector.method == "log":
+        found = blob_log(image, min_sigma=small, max_sigma=large, num_sigma=LOG_STEPS, threshold=LOG_PEAK * contrast, overlap=OVERLAP)
+    elif detector.method == "dog":
+        found = blob_dog(image, min_sigma=small, max_sigma=large, sigma_ratio=DOG_RATIO, threshold=LOG_PEAK * contrast, overlap=OVERLAP)
+    else:
+        found = blob_doh(image, min_sigma=small, max_sigma=large, num_sigma=LOG_STEPS, threshold=DOH_PEAK * contrast**2, overlap=OVERLAP)
     rows, columns = found[:, 0].astype(int), found[:, 1].astype(int)
     found = found[inside[rows, columns]]
     return found[:, 1::-1] + mask.corner_px, 2 * np.pi * found[:, 2] ** 2

@@ -87,7 +87,7 @@ def test_the_papers_models_take_the_same_way(model, recording, tmp_path):
 def test_the_papers_comparison_is_one_command_and_goes_on_where_it_was(recording, tmp_path):
     command = ("study", "tac-vgnn", "--data", recording, "--sensor", "mg400-127", "--out", tmp_path, "--epochs", 1, "--no-contacts")
     said = twin(*command, "--models", "gnn,vgnn-without-graph", "--batches", "16")
-    assert "gnn, seed 0: finished, pose_2" in said
+    assert "gnn, seed 0: finished, depth" in said
     weights = tmp_path / "runs" / "gnn-raw-0" / "weights.pt"
     written = weights.stat().st_mtime_ns
     twin(*command, "--models", "gnn,vgnn-without-graph", "--batches", "", "--max-minutes", 0)

@@ -23,8 +23,11 @@ OWN = ("EdgeFollow", "SurfaceFollow", "ContourFollow", "GentlePress", "ObjectRol
 """Names of this package's tasks."""
 IN_SCENES = {name: f"training.mujoco.task:{name}" for name in ("GraspLift", "PegInsert")}
 """By name: the environments in MuJoCo scenes (extra ``mujoco``)."""
-_WHERE = "training.environments.environment"
-_PLACES = {"Options": "training.environments.batch", "TactileEnv": _WHERE, "TactileVectorEnv": _WHERE}
+_PLACES = {
+    "Options": "training.environments.batch",
+    "TactileEnv": "training.environments.environment",
+    "TactileVectorEnv": "training.environments.environment",
+}
 """By public name: its module."""
 
 
@@ -35,13 +38,14 @@ def ids() -> tuple[str, ...]:
 
 def register_all() -> None:
     """Register the environments; a second call has no effect. Some versions of gymnasium call it where the package is installed."""
+    where = _PLACES["TactileEnv"]
     for name, place in IN_SCENES.items():
         if (full := f"{NAMESPACE}/{name}-v{VERSION}") not in registry:
             register(id=full, entry_point=place)
     for full in ids():
         if full not in registry:
             task = full.removeprefix(f"{NAMESPACE}/").removesuffix(f"-v{VERSION}")
-            register(id=full, entry_point=f"{_WHERE}:TactileEnv", vector_entry_point=f"{_WHERE}:TactileVectorEnv", kwargs={"task": task})
+            register(id=full, entry_point=f"{where}:TactileEnv", vector_entry_point=f"{where}:TactileVectorEnv", kwargs={"task": task})
 
 
 def __getattr__(name: str) -> Any:

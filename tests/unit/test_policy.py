@@ -205,6 +205,13 @@ def test_pictures_are_seen_as_means_of_squares():
     assert seen[1, 2, 1] == pytest.approx(0.5) and seen.sum() == pytest.approx(0.5)
 
 
+def test_a_plan_names_what_is_missing_or_of_a_wrong_kind():
+    with pytest.raises(OptionError, match="`task` is missing"):
+        LearnPlan()
+    with pytest.raises(OptionError, match="options="):
+        LearnPlan("SurfaceFollow", options={"stack": 2})
+
+
 def test_a_policy_that_learnt_without_friction_history_is_also_judged_with_it(tmp_path, few_looks, monkeypatch):
     asked = []
     monkeypatch.setattr(

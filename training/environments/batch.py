@@ -54,12 +54,15 @@ def _as_name(given: Any) -> str:
 
 
 def _as_tuple(given: Any) -> Any:
-    return (given,) if isinstance(given, str | PathLike) else tuple(given) if isinstance(given, Iterable) else given
+    several = (given,) if isinstance(given, str | PathLike) else tuple(given) if isinstance(given, Iterable) else ()
+    if not several:
+        raise ValueError("expected a name or several")
+    return several
 
 
 CHECKED = ConfigDict(strict=True, allow_inf_nan=False, extra="forbid")
 Named = Annotated[str, BeforeValidator(_as_name)]
-Several = BeforeValidator(_as_tuple), Field(min_length=1)
+Several = BeforeValidator(_as_tuple)
 FORMER_OPTIONS = {"friction_memory": "friction_history"}
 """Present names of options by their names in version 1."""
 
@@ -75,6 +78,10 @@ class Settings:
             return check(given)
         except ValidationError as error:
             found, known = error.errors(include_url=False)[0], [field.name for field in fields(cls)]
+            if not found["loc"]:  # no settings at all: the plan that holds them names them
+                raise
+            if found["type"] == "missing":
+                raise OptionError(f"`{found['loc'][0]}` is missing") from error
             name, said = str(found["loc"][0]), problem_text(found)
             if name not in known:
                 near = get_close_matches(name, known, n=1)
@@ -117,10 +124,10 @@ class Options(Settings):
     sensor: Named = "mg400-331"
     observation: Kind = "pins"
     stack: Annotated[int, Field(ge=1, le=MOST_STACK)] = 1
-    axes: Annotated[tuple[Axis, ...], *Several] | None = None
+    axes: Annotated[tuple[Axis, ...], Several] | None = None
     backend: BackendName = "surrogate"
     surrogate: Named | None = None
-    objects: Annotated[tuple[Named, ...], *Several] | None = None
+    objects: Annotated[tuple[Named, ...], Several] | None = None
     randomise: Named | None = None
     pictures: Pictures = "none"
     friction_history: bool = True
@@ -128,7 +135,7 @@ class Options(Settings):
 
     def __post_init__(self) -> None:
         if len(set(self.axes or ())) < len(self.axes or ()):
-            raise OptionError(f"axes={self.axes!r}: expected each once")
+            raise OptionError(f"axes={self.axes!r}: expected each axis once")
         if self.backend == "fem" and not self.friction_history:
             raise OptionError("friction_history=False needs backend='surrogate': finite elements always have history-dependent friction")
 

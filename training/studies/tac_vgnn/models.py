@@ -159,7 +159,7 @@ class PeakMemory:
             if anew:
                 FORGET.write_text("5", encoding="utf-8")
             return int(STATUS.read_text(encoding="utf-8").partition("VmHWM:")[2].split()[0]) * 1024 / MIB
-        except OSError:
+        except (OSError, IndexError):  # no such files, or no such line
             return float("nan")
 
 

@@ -27,6 +27,8 @@ FIRST_NUMBERED_REPLIES = (1, 5, 6)
 SHORT_BYTES = 1000
 # Interval in s at which a waiting thread checks again.
 POLL_S = 0.002
+# Time in s after which a client that has connected to a port is being served, also on a busy machine.
+ACCEPTS_S = 0.3
 # Interval in s of the finite differences that give speeds: the period of the fastest feedback.
 DIFFERENCE_S = 0.008
 FAULTS = {
@@ -205,8 +207,11 @@ class Mg400Emulator(EmulatedArm):
 
     def _execute(self, port: int, request: Request) -> str:
         refuse_if("no-tcp-mode" in self.faults)
-        alone = not self._servers[wire.MOTION_PORT].clients
-        refuse_if(alone and ("needs-motion-client" in self.faults or "motion-port-closed" in self.faults), wire.ErrorId.NO_SUCH_COMMAND)
+        if "needs-motion-client" in self.faults or "motion-port-closed" in self.faults:
+            motion, until_s = self._servers[wire.MOTION_PORT], time.monotonic() + ACCEPTS_S
+            while not motion.clients and time.monotonic() < until_s:
+                time.sleep(POLL_S)
+            refuse_if(not motion.clients, wire.ErrorId.NO_SUCH_COMMAND)
         commands = self._commands.dashboard if port == wire.DASHBOARD_PORT else self._commands.motion
         refuse_if(request.name not in commands, wire.ErrorId.NO_SUCH_COMMAND)
         with self.arm.lock:

@@ -179,7 +179,7 @@ def test_a_stream_of_thresholded_pictures_is_not_frozen_at_rest():
         first = camera.read(timeout_s=2.0)
         time.sleep(1.0)
         assert not camera.fault and not camera.blind() and camera.read_latest().time_s > first.time_s + 0.5
-        assert all("lost before they arrived" in note for note in camera.notes()), "a busy machine may lose some"
+        assert not any("repeat" in note for note in camera.notes()), camera.notes()
 
 
 @pytest.mark.parametrize("blocking", [True, False])

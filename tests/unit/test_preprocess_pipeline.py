@@ -8,6 +8,7 @@ import pytest
 from drawn_frames import cap_radii_px, draw_discs, drawn_frame, smooth_warp
 
 from scenes import load_sensor
+from scenes.pins import PinsSpec
 from twin.camera.capture import record
 from twin.errors import FrameError
 from twin.frames import open_recording
@@ -405,6 +406,15 @@ def test_exchanged_pins_fold_the_layout():
     exchanged = rest.pins_px.copy()
     exchanged[[5, 15]] = exchanged[[15, 5]]
     assert folded_fraction(rest, rest.pins_px) == 0.0 < folded_fraction(rest, exchanged)
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(2, 4), (3, 2)])
+def test_a_layout_of_outmost_pins_alone_is_found(columns, rows):
+    spec = load_sensor("ur5-331")
+    spec = spec.alter(pins=PinsSpec(layout="grid", columns=columns, rows=rows), pipeline={"raw": spec.pipeline.raw.alter(rest_px=())})
+    pipeline = Pipeline(spec, Form.RAW)
+    observation = pipeline(drawn_frame(spec, Form.RAW, pipeline.reference.pins_px))
+    assert observation.valid and observation.found == columns * rows
 
 
 @pytest.mark.parametrize("name", ["mg400-127", "ur5-331"])

@@ -76,7 +76,11 @@ def write_calibration(folder: Path, measured: MeasuredFrames, moved: np.ndarray,
     solved = np.flatnonzero(np.isfinite(fit.after_px) & np.isfinite(fit.before_px) & (fit.trust >= TRUSTED))
     chosen = solved[np.argsort(fit.before_px[solved])[[len(solved) // 2, -1]]] if len(solved) else solved
     page = Page(f"Contact of {summary['sensor']}", "twin calibrate contact", topic="TacTip twin: contact calibration", lead=_lead(summary))
-    page.notice("Labels that are not trusted, because neither hypothesis fits", summary["distrusted"], tone="bad")
+    page.notice(
+        "Labels that are not trusted, because neither hypothesis fits",
+        [", ".join(names)] if (names := summary["distrusted"]) else [],
+        tone="bad",
+    )
     page.notice("Warnings", summary["warnings"], tone="bad")
     page.notice("Notes", [summary["newtons"]["explanation"], *summary["problems"]])
     _parameters_section(page, summary)

@@ -196,4 +196,5 @@ def count_turned_over(px: np.ndarray, triangles: np.ndarray, known: np.ndarray) 
 
 def folded_fraction(reference: Reference, nodes_px: np.ndarray) -> float:
     """Share of the reference's triangles whose orientation is reversed when the pins move to ``nodes_px`` (N, 2)."""
-    return float(count_turned_over(nodes_px, reference.triangles, np.ones(len(nodes_px), bool)) / len(reference.triangles))
+    over: int = count_turned_over(nodes_px, reference.triangles, np.ones(len(nodes_px), bool))
+    return over / max(len(reference.triangles), 1)  # a small layout has outmost pins alone, and no triangles

@@ -30,7 +30,7 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def decorate(function: Callable[..., Any]) -> Any:
         try:
-            dispatcher = numba.njit(cache=True, **options)(function)
+            dispatcher = numba.njit(cache=True, no_cfunc_wrapper=True, **options)(function)  # Python alone calls it
         except RuntimeError as error:
             if "cannot cache function" not in str(error):
                 raise

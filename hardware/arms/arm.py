@@ -1,11 +1,11 @@
-"""The interface of an arm for a loop (``Arm``, ``ArmState``), and the common part of all drivers (``BaseArm``).
+"""The interface of an arm for a loop (``Arm``, ``ArmState``), the common part of all drivers (``BaseArm``), and a simulated arm.
 
 Units are mm and degrees; times are ``time.monotonic()`` seconds.
 """
 
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
@@ -13,8 +13,7 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
-from hardware.arms.kinematics import FARTHEST, Kinematics, OutOfReachError, finite_numbers
-from hardware.arms.motion import way_between
+from hardware.arms import motion
 from hardware.errors import Connection, DeviceError, StaleDataError, undo
 from twin.errors import ErrorsAs
 
@@ -166,7 +165,7 @@ class BaseArm(Connection):
             state = self.state()
             if state.error:
                 raise DeviceError(f"{self.name}: {state.error}")
-            off_mm, off_deg = way_between(state.pose, np.asarray(pose, float), 6)  # R may differ by full turns
+            off_mm, off_deg = motion.way_between(state.pose, np.asarray(pose, float), 6)  # R may differ by full turns
             known, near = state.time_s >= asked_s, off_mm <= tolerance_mm and off_deg <= tolerance_deg
             if known and near and not (at_rest and state.moving):
                 return state
@@ -204,7 +203,7 @@ class BaseArm(Connection):
 
     def _require_possible(self, pose: np.ndarray) -> None:
         """Raise ``StaleDataError`` if a reported pose (6,) is impossible, because the arm's real pose is then unknown."""
-        if not (np.abs(pose) < FARTHEST).all():  # also true for NaN
+        if not (np.abs(pose) < motion.FARTHEST).all():  # also true for NaN
             raise StaleDataError(f"{self.name}: reports the pose {pose}, which no arm reaches; stop it, then restart it")
 
     def _may_move(self) -> bool:
@@ -238,17 +237,17 @@ class BaseArm(Connection):
 class KinematicArm(BaseArm):
     """Base class of arms whose kinematics are known from the start. Each target is checked by them before it is sent."""
 
-    kinematics: Kinematics
+    kinematics: motion.Kinematics
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         with self._watch_move():
-            sent = self.kinematics.nearest_pose(finite_numbers(f"{self.name}: the pose", pose, 6))
+            sent = self.kinematics.nearest_pose(motion.finite_numbers(f"{self.name}: the pose", pose, 6))
             self._move(self._joints_at(sent), sent, wait=wait, timeout_s=timeout_s)
         return sent
 
     def move_joints(self, joints_deg: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         with self._watch_move():
-            sent = finite_numbers(f"{self.name}: the joint angles", joints_deg, self.axes)
+            sent = motion.finite_numbers(f"{self.name}: the joint angles", joints_deg, self.axes)
             self._move(sent, None, wait=wait, timeout_s=timeout_s)
         return sent
 
@@ -258,10 +257,89 @@ class KinematicArm(BaseArm):
 
     def _joints_at(self, pose: np.ndarray) -> np.ndarray:
         """Joints (J,) at a pose (6,); ``DeviceError`` if it is out of reach."""
-        with ErrorsAs(OutOfReachError, lambda error: DeviceError(f"{self.name}: {error}; nothing was sent")):
+        with ErrorsAs(motion.OutOfReachError, lambda error: DeviceError(f"{self.name}: {error}; nothing was sent")):
             return self.kinematics.inverse(pose)
 
     def _require_within(self, joints_deg: np.ndarray) -> None:
         """Raise ``DeviceError`` unless the joints (J,) are within the limits."""
         if violation := self.kinematics.violation(joints_deg):
             raise DeviceError(f"{self.name}: {violation.text}; nothing was sent. Choose a target within reach and limits")
+
+
+class SimulatedArm(KinematicArm):
+    """A simulated arm of six axes (an ideal stage) or four (the MG400's linkage).
+
+    Parameters
+    ----------
+    axes : {4, 6}
+    pose : (6,) float
+        Pose at the start.
+    time_scale : float
+        Factor by which it moves faster than a real arm (``inf``: instantly).
+    """
+
+    def __init__(
+        self, *, axes: int = 6, pose: Sequence[float] | np.ndarray = (300.0, 0.0, 0.0, 0.0, 0.0, 0.0), time_scale: float = 1.0
+    ) -> None:
+        if axes not in (4, 6):
+            raise DeviceError(f"a simulated arm has 4 or 6 axes, not {axes}")
+        self.name, self.axes = f"simulated arm of {axes} axes", axes
+        self.kinematics = motion.StageKinematics() if axes == 6 else motion.MG400
+        self.track = motion.MotionTrack(self.kinematics, self.kinematics.inverse(np.asarray(pose, float)))
+        self._speeds, self._scale = motion.Speeds(100.0, 100.0, 1000.0, 1000.0), time_scale
+        self._connected = self._enabled = False
+
+    @property
+    def is_connected(self) -> bool:
+        return self._connected
+
+    def connect(self) -> None:
+        self._require_disconnected()
+        self._connected = True
+
+    def disconnect(self) -> None:
+        if self._connected:
+            self.stop()
+            self._connected = self._enabled = False
+
+    def enable(self) -> None:
+        self._require_connected()
+        self._enabled = True
+
+    def disable(self) -> None:
+        self._require_connected()
+        self.track.stop(time.monotonic())
+        self._enabled = False
+
+    def clear_error(self) -> None:
+        self._require_connected()
+
+    def stop(self) -> None:
+        self._require_connected()
+        self.track.stop(time.monotonic())
+
+    def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState:
+        return self._state_at(time.monotonic())
+
+    def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
+        self._require_speeds(linear_mm_s, angular_deg_s)
+        self._speeds = motion.Speeds(linear_mm_s, angular_deg_s, self._speeds.linear_mm_s2, self._speeds.angular_deg_s2)
+
+    def _state_at(self, time_s: float) -> ArmState:
+        self._require_connected()
+        return ArmState(self.track.pose(time_s), self.track.joints_deg(time_s), time_s, self._enabled, self.track.moving(time_s))
+
+    def _move(self, joints: np.ndarray, pose: np.ndarray | None, *, wait: bool, timeout_s: float) -> None:
+        self._require_connected()
+        if not self._enabled:
+            raise DeviceError(f"{self.name}: not enabled; call enable() first")
+        self._begin(joints, pose)
+        if wait:
+            self._wait_until_settled(self.kinematics.forward(joints) if pose is None else pose, timeout_s=timeout_s)
+
+    def _begin(self, joints: np.ndarray, pose: np.ndarray | None) -> motion.Piece:
+        end, speeds = joints if pose is None else pose, self._speeds.scale_time(self._scale)
+        piece = self.track.move(end, speeds, linear=pose is not None, now_s=time.monotonic())
+        if isinstance(piece, motion.Violation):
+            raise DeviceError(f"{self.name}: refused (alarm {piece.code}): {piece.text}; choose a target within reach and limits")
+        return piece

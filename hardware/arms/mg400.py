@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hardware.arms import kinematics as arms
 from hardware.arms import mg400_wire as wire
+from hardware.arms import motion
 from hardware.arms.arm import POLL_S, ArmState, KinematicArm
 from hardware.arms.dobot_alarms import explain
-from hardware.arms.kinematics import LinkageKinematics
 from hardware.arms.mg400_link import REPLY_TIMEOUT_S, SILENCE_S, CommandPort, Feedback, NoReplyError
+from hardware.arms.motion import LinkageKinematics
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
 LOG = logging.getLogger(__name__)
@@ -87,7 +87,7 @@ class MG400(KinematicArm):
         host: str = wire.DEFAULT_HOSTS["LAN1"],
         *,
         ports: Mg400Ports = Mg400Ports(),  # noqa: B008  (frozen)
-        kinematics: LinkageKinematics = arms.MG400,
+        kinematics: LinkageKinematics = motion.MG400,
         lenient: bool = False,
         supervised: bool = True,
     ) -> None:

@@ -11,8 +11,7 @@ import time
 import numpy as np
 
 from hardware.arms.arm import Arm
-from hardware.arms.kinematics import Kinematics, StageKinematics
-from hardware.arms.motion import between, way_between
+from hardware.arms.motion import Kinematics, StageKinematics, between, way_between
 from hardware.errors import DeviceError
 
 # Longest duration of a piece, in s. It is also the longest delay until the arm turns to a newer target.

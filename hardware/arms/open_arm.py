@@ -1,12 +1,11 @@
 """Makes an arm of any kind from its specification: ``open_arm("mg400:192.168.1.6")``."""
 
-from hardware.arms.arm import Arm
+from hardware.arms.arm import Arm, SimulatedArm
 from hardware.arms.magician import Magician, attached_ports
 from hardware.arms.magician_wire import USB_VENDORS
 from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.arms.mg400_wire import DEFAULT_HOSTS, address_of
 from hardware.arms.ros2 import ARM_FORM, ros2_arm
-from hardware.arms.simulated import SimulatedArm
 from hardware.arms.ur.driver import UR
 from hardware.errors import DeviceError
 from scenes.files import quote

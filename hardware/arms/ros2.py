@@ -17,8 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, BaseArm
-from hardware.arms.kinematics import StageKinematics, finite_numbers
-from hardware.arms.motion import MotionTrack, Speeds
+from hardware.arms.motion import MotionTrack, Speeds, StageKinematics, finite_numbers
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 from hardware.ros2.dds import Participant, Reader, Writer, domain_id
 from scenes.files import quote

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from hardware.arms.kinematics import MAGICIAN, NO_INVERSE, OutOfReachError, Violation
 from hardware.arms.magician_wire import Id, Message, Ptp
-from hardware.arms.motion import MotionTrack, Speeds, check_line, circle
+from hardware.arms.motion import MAGICIAN, NO_INVERSE, MotionTrack, OutOfReachError, Speeds, Violation, check_line, circle
 from hardware.emulators.faults import Faults
 
 LOG = logging.getLogger(__name__)

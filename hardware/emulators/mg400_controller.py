@@ -8,9 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hardware.arms.kinematics import MG400, OutOfReachError, Violation
 from hardware.arms.mg400_wire import MAX_JOINT_DEG_S, MAX_LINEAR_MM_S, ErrorId, Mode
-from hardware.arms.motion import MotionTrack, Piece, Speeds, check_line
+from hardware.arms.motion import MG400, MotionTrack, OutOfReachError, Piece, Speeds, Violation, check_line
 from hardware.emulators.faults import Faults
 from twin.errors import ErrorsAs
 

@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hardware.arms.kinematics import Violation
-from hardware.arms.motion import MotionTrack, Speeds
+from hardware.arms.motion import MotionTrack, Speeds, Violation
 from hardware.arms.ur.driver import DASHBOARD_PORT, EMERGENCY, IDLE, NORMAL, PAUSED, PLAYING, POWER_OFF, PROTECTIVE, RUNNING, STOPPED
 from hardware.arms.ur.kinematics import UrKinematics, pose_from_ur, pose_to_ur
 from hardware.emulators.faults import SECONDS, SHARE, EmulatedArm, Fault, Faults, PortServer

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
-from hardware.arms.kinematics import Kinematics, LinkageKinematics
+from hardware.arms.motion import Kinematics, LinkageKinematics
 from hardware.errors import DeviceError
 from scenes.object import ObjectSpec
 from scenes.servo import PlacementSpec

@@ -16,9 +16,8 @@ from types import TracebackType
 
 import numpy as np
 
-from hardware.arms.arm import Arm, ArmState
+from hardware.arms.arm import Arm, ArmState, SimulatedArm
 from hardware.arms.open_arm import kind_of, open_arm
-from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.choose import open_camera
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.cameras.twin import PoseSource, TwinCamera, preview_of

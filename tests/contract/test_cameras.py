@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from noisy_camera import NoisyCamera, number_of
 
-from hardware.arms.simulated import SimulatedArm
+from hardware.arms.arm import SimulatedArm
 from hardware.cameras import reader
 from hardware.cameras.choose import open_camera
 from hardware.cameras.mjpeg import CONTENT_TYPE, MjpegCamera, Parts, jpeg_of, write_part

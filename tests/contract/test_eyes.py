@@ -16,7 +16,7 @@ from noisy_camera import NoisyCamera
 from pins_camera import AT_REST, SENSOR, StudioModel, Switched, shows
 from true_estimator import TrueEstimate, TrueEstimator
 
-from hardware.arms.simulated import SimulatedArm
+from hardware.arms.arm import SimulatedArm
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.reader import DevicePicture
 from hardware.collect.collect import LIFT_MM, Collection, CollectPlan, collect, collect_frames

@@ -20,7 +20,7 @@ from studio_client import StudioClient
 from true_estimator import TrueEstimate, TrueEstimator
 from typer.testing import CliRunner
 
-from hardware.arms.simulated import SimulatedArm
+from hardware.arms.arm import SimulatedArm
 from hardware.cameras.reader import DevicePicture, LiveSource
 from hardware.cameras.recorded import SessionSource
 from hardware.cameras.twin import preview_of

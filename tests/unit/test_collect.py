@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from faulty_arm import ArmFault, FaultyArm
 
-from hardware.arms.simulated import SimulatedArm
+from hardware.arms.arm import SimulatedArm
 from hardware.cameras.reader import DevicePicture, LiveSource
 from hardware.collect.collect import COLUMNS, META, Collection, WorkFrame, collect, draw_contact
 from hardware.errors import DeviceError

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hardware.arms.kinematics import LIMIT_TOLERANCE_DEG, TARGET_LIMIT, OutOfReachError, StageKinematics, Violation
+from hardware.arms.motion import LIMIT_TOLERANCE_DEG, TARGET_LIMIT, OutOfReachError, StageKinematics, Violation
 from twin.rig.arm_pose import matrix_of
 
 # d1, a2, a3, d4, d5, d6 in mm, by the model and the major version of its software (from 5 on: e-Series).

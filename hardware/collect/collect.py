@@ -23,9 +23,8 @@ from hardware.arms.arm import ArmState
 from hardware.cameras.mjpeg import without_secrets
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject
-from hardware.workcell.build import Rig, build_rig, check_plan
-from hardware.workcell.mover import Mover
-from scenes import ObjectSpec, SensorSpec, ServoSpec
+from hardware.workcell.build import Mover, Rig, RigPlan, build_rig, check_plan
+from scenes import SensorSpec
 from scenes.experiment import LABELS, ExperimentSpec
 from scenes.files import quote
 from twin.errors import ErrorsAs, FrameError, format_count
@@ -326,21 +325,15 @@ class _Stops:
             return self.mover.frame_after(state.time_s, timeout_s=self.frame_timeout_s)
 
 
-@dataclass(frozen=True)
-class CollectPlan:
+@dataclass(frozen=True, kw_only=True)
+class CollectPlan(RigPlan):
     """Settings of a collection, and its devices.
 
     Attributes
     ----------
     sensor : SensorSpec
-    obj : ObjectSpec
-        The object that is touched.
     experiment : ExperimentSpec
         Experiment that defines the contacts.
-    servo : ServoSpec
-        The arm's speeds, and the object's place.
-    camera, arm : str
-        As for ``build_rig``.
     count : int
         Number of contacts in the folder at the end.
     seed : int or None
@@ -349,33 +342,16 @@ class CollectPlan:
         Distribution of the contacts over the experiment's ranges.
     form : Form or None
         Form of the frames. None: the form of the sensor's recordings if it has one.
-    limits : str or None
-        Safety limits, by name or file. None: those of the arm's kind.
-    plain_light : bool
-        Draw the twin's frames without path tracing; see ``build_rig``.
     also : tuple of str
         Further formats in which each contact is kept as soon as it is made, each in a subfolder.
-    dry_run : bool
-        End after the check of the plan, before anything moves.
-    ros2 : str or None
-        Namespace in which frames, pins and the arm's pose are published as ROS 2 topics.
     """
 
     sensor: SensorSpec
-    obj: ObjectSpec
     experiment: ExperimentSpec
-    servo: ServoSpec
-    camera: str
-    arm: str
     count: int
     seed: int | None = None
     design: str = "random"
     form: Form | None = None
-    limits: str | None = None
-    plain_light: bool = False
-    also: tuple[str, ...] = ()
-    dry_run: bool = False
-    ros2: str | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.count <= MOST_CONTACTS:
@@ -414,19 +390,7 @@ def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent)
         The frame without contact shows a contact, or not this sensor.
     """
     kept = KeptAlso(out, plan.also, plan.sensor)
-    rig = build_rig(
-        plan.sensor,
-        plan.obj,
-        plan.servo.placement,
-        plan.experiment,
-        camera=plan.camera,
-        arm=plan.arm,
-        form=plan.form,
-        limits=plan.limits,
-        seed=plan.sampling_seed,
-        plain_light=plan.plain_light,
-        at_once=True,
-    )
+    rig = build_rig(plan, plan.sensor, plan.experiment, form=plan.form, seed=plan.sampling_seed, at_once=True)
     collection = Collection(out, _about(plan, rig), rig.source.form)
     before = collection.count
 

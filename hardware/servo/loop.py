@@ -22,8 +22,7 @@ from hardware.safety.eyes import BlindError, pieces_to
 from hardware.safety.safe_arm import RefusedMoveError
 from hardware.servo.law import Memory, Reading, servo_step, tangent_of
 from hardware.servo.timing import TimeSpread, Timing
-from hardware.workcell.build import Rig
-from hardware.workcell.mover import MOVE_TIMEOUT_S, Mover
+from hardware.workcell.build import MOVE_TIMEOUT_S, Mover, Rig
 from scenes.servo import ServoSpec
 from twin.errors import ErrorsAs
 from twin.estimate import Estimate, Estimator

@@ -18,7 +18,7 @@ from free_ports import free_offset
 
 from hardware.arms.mg400_wire import DASHBOARD_PORT
 from hardware.servo.loop import Decided, LoopSettings, ServoLoop
-from hardware.workcell.build import build_rig
+from hardware.workcell.build import RigPlan, build_rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.errors import TwinError
 from twin.estimate import SensorModel
@@ -242,9 +242,8 @@ def run_round(model: SensorModel, bench: Bench) -> Round:
     """Connect, follow a part of the object's outline, let go, disconnect."""
     servo = load_servo(SERVO)
     spec = load_sensor(SENSOR)
-    rig = build_rig(
-        spec, load_object(OBJECT), servo.placement, load_experiment(servo.experiment), camera=bench.url, arm=bench.address, form=model.form
-    )
+    plan = RigPlan(load_object(OBJECT), servo, camera=bench.url, arm=bench.address)
+    rig = build_rig(plan, spec, load_experiment(servo.experiment), form=model.form)
     settings = LoopSettings(ROUND_STEPS, blocking=False, period_s=1.0 / RATE_HZ, frame_timeout_s=rig.frame_timeout_s, give_up_s=GIVE_UP_S)
     began_s, told, loop = time.monotonic(), "", None
     try:

@@ -187,7 +187,7 @@ def test_killed_before_the_first_row_it_begins_anew(rig, tmp_path):
 @pytest.mark.parametrize(("share", "reached"), [(0.5, True), (0.0, False)])
 def test_a_contact_that_the_arm_stops_short_of_is_not_the_one_that_was_asked_for(rig, tmp_path, share, reached, monkeypatch):
     experiment, placed, arm = rig
-    monkeypatch.setattr("hardware.workcell.mover.MOST_PIECES", 20)
+    monkeypatch.setattr("hardware.workcell.build.MOST_PIECES", 20)
     move = arm.move_linear
     arm.move_linear = lambda pose, **options: move(share * pose + (1 - share) * arm.state().pose, **options)
     if reached:

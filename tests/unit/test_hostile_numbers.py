@@ -65,7 +65,8 @@ def test_steps_and_contacts_beyond_all_bounds_are_refused(count):
     with pytest.raises(DeviceError, match=f"`steps` {count}: expected 1 to"):
         FollowPlan(thing, servo, steps=count)
     with pytest.raises(DeviceError, match=f"`count` {count}: a collection has 1 to"):
-        CollectPlan(load_sensor("mg400-127"), thing, load_experiment("surface-2d"), servo, "twin", "simulated", count)
+        how = {"sensor": load_sensor("mg400-127"), "experiment": load_experiment("surface-2d")}
+        CollectPlan(thing, servo, **how, camera="twin", arm="simulated", count=count)
 
 
 NUMBERS = [

@@ -1,11 +1,26 @@
-"""The protocol of all cameras: ``FrameSource``, a source of frames. Times are ``time.monotonic()`` seconds."""
+"""Sources of frames: their protocol (``FrameSource``), frames from disk, and the source that a user's text for ``camera`` names.
 
+Times are ``time.monotonic()`` seconds.
+"""
+
+import os
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
+from pathlib import Path
 from types import TracebackType
 from typing import Protocol
 
-from hardware.errors import DeviceError
+from hardware.cameras.mjpeg import MjpegCamera, without_secrets
+from hardware.cameras.ros2 import Ros2Camera
+from hardware.cameras.uvc import FFMPEG, UvcCamera, VideoCamera
+from hardware.errors import Connection, DeviceError
+from scenes.files import LONGEST_PATH, quote
+from scenes.plugins import others
+from scenes.sensor import SensorSpec
 from twin.errors import ErrorsAs
+from twin.frames import Recording, open_recording
+from twin.frames.forms import frame_size
+from twin.records.session import Session, is_session
 from twin.types import Form, Frame
 
 
@@ -89,3 +104,123 @@ def await_frame(source: FrameSource, *, timeout_s: float | None = None, after_s:
     timeout_s = source.first_frame_s if timeout_s is None else timeout_s
     with no_frame():
         return source.read(timeout_s=timeout_s) if after_s is None else source.read_after(after_s, timeout_s=timeout_s)
+
+
+class RecordedSource(Connection):
+    """Frames of a folder, a recording, a video or a session. They wait for their reader, and have an end.
+
+    Parameters
+    ----------
+    name : str
+    frames : Recording or Session
+    notes : callable
+        Irregularities in the frames read so far, one line each.
+    """
+
+    is_live = False
+    first_frame_s = 0.0
+    dropped = 0
+    fault = ""
+    streams = False  # frames come when they are read
+    same_s = None
+
+    def __init__(self, name: str, frames: Recording | Session, notes: Callable[[], list[str]]) -> None:
+        self.name, self.form, self.notes, self._frames = name, frames.form, notes, frames
+        self._left: Iterator[Frame] | None = None
+        self._newest: Frame | None = None
+
+    def blind(self) -> str:
+        return ""
+
+    @property
+    def is_connected(self) -> bool:
+        return self._left is not None
+
+    def connect(self) -> None:
+        self._require_disconnected()
+        self._left, self._newest = iter(self._frames), None
+
+    def disconnect(self) -> None:
+        self._left = None
+
+    def read(self, *, timeout_s: float = 1.0) -> Frame:
+        self._require_connected()
+        frame = next(self._left or iter(()), None)
+        if frame is None:
+            raise EOFError(f"{self.name}: the recording is at its end")
+        self._newest = frame
+        return frame
+
+    def read_latest(self, *, max_age_s: float = 0.5) -> Frame:
+        """The frame that was read last, or the first one. A recording has no age."""
+        return self.read() if self._newest is None or self._left is None else self._newest
+
+    def read_after(self, time_s: float, *, timeout_s: float = 2.0) -> Frame:
+        """The next frame, whatever its time is, because a recording waits for its reader."""
+        return self.read()
+
+
+class SessionSource(RecordedSource):
+    """A session's frames in the order of its steps. A frame that several steps used is given once for each.
+
+    Parameters
+    ----------
+    folder : path
+
+    Raises
+    ------
+    FrameError
+        As for ``twin.records.session.Session``.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.session = Session(folder)
+        super().__init__(str(folder), self.session, lambda: self.session.notes)
+
+
+def open_camera(text: str, spec: SensorSpec | None = None, form: Form | None = None, *, twin: FrameSource | None = None) -> FrameSource:
+    """Make a frame source. It is not connected yet.
+
+    Parameters
+    ----------
+    text : str
+        ``0``, ``/dev/video2`` or ``usb:1-1.2`` (a USB camera; ``?exposure=7.8&gain=4`` sets and measures it), ``rtsp://`` or
+        ``ffmpeg:http://`` (a video stream), an ``http://`` address (a stream of pictures, or a single
+        picture), ``ros2:/topic``, ``twin``, a folder of pictures, a
+        recording, a recorded session or a video.
+    spec : SensorSpec, optional
+    form : Form, optional
+        Form of the frames. By default a live source has the form of the sensor's recordings if the sensor has one, otherwise raw. The form
+        of recorded frames is determined from the frames.
+    twin : FrameSource, optional
+        The source that the text ``twin`` selects.
+
+    Raises
+    ------
+    DeviceError, FrameError
+        There is no such camera, recording or file.
+    """
+    live_form = form or (Form.PROCESSED if spec is not None and spec.recording is not None else Form.RAW)
+    if spec is not None:
+        frame_size(spec, live_form)
+    if text == "twin":
+        if twin is None:
+            raise DeviceError("the twin as a camera needs an arm and an object; use 'twin servo', 'twin collect' or 'twin emulate camera'")
+        return twin
+    if text.partition("?")[0].isdecimal() or text.startswith(("/dev/", "usb:")):
+        return UvcCamera(text, spec, live_form)
+    kind, _, rest = text.partition(":")
+    if kind == "ros2":
+        return Ros2Camera(rest, spec, live_form)
+    if (there := others("cameras", ("twin", "http", "https", "ros2", "usb", FFMPEG[:-1]))) and kind in there:
+        source: FrameSource = there[kind](rest, spec, live_form)
+        return source
+    if "://" in text:
+        return (MjpegCamera if kind in ("http", "https") else VideoCamera)(text, spec, live_form)
+    if not os.path.exists(text):
+        expected = "a number, /dev/videoN, usb:PORT, http://..., rtsp://..., ros2:/topic, twin, a folder or a video"
+        raise DeviceError(f"{quote(without_secrets(text), LONGEST_PATH)}: no such camera, file or folder; expected {expected}")
+    if is_session(text):
+        return SessionSource(text)
+    recording = open_recording(text, spec, form)
+    return RecordedSource(text, recording, recording.notes)

@@ -10,8 +10,7 @@ import numpy as np
 from hardware.arms.arm import Arm
 from hardware.arms.newest import NewestTarget
 from hardware.arms.open_arm import kind_of, open_arm
-from hardware.cameras.choose import open_camera
-from hardware.cameras.source import FrameSource
+from hardware.cameras.source import FrameSource, open_camera
 from hardware.errors import Connection, DeviceError, StaleDataError, leave
 from hardware.live.doctor import cameras
 from hardware.safety.decide import load_limits

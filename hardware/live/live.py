@@ -17,9 +17,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from hardware.cameras.choose import open_camera
-from hardware.cameras.recorded import SessionSource
-from hardware.cameras.source import FrameSource, await_frame
+from hardware.cameras.source import FrameSource, SessionSource, await_frame, open_camera
 from hardware.errors import DeviceError
 from hardware.servo.timing import TimeSpread, Timing
 from hardware.workcell.build import load_rest_frame

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from hardware.arms.open_arm import kind_of, open_arm
-from hardware.cameras.choose import open_camera
-from hardware.cameras.source import FrameSource
+from hardware.cameras.source import FrameSource, open_camera
 from hardware.errors import DeviceError
 from hardware.live.live import LiveSession, estimate_line
 from hardware.safety.decide import load_limits

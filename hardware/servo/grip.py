@@ -24,8 +24,7 @@ from hardware.arms.arm import POLL_S, Arm, ArmState
 from hardware.arms.mg400 import MG400
 from hardware.arms.open_arm import kind_of
 from hardware.arms.ros2 import CONNECT_S, topic_in
-from hardware.cameras.choose import open_camera
-from hardware.cameras.source import FrameSource, no_frame
+from hardware.cameras.source import FrameSource, no_frame, open_camera
 from hardware.cameras.twin import TwinCamera
 from hardware.errors import DeviceError
 from hardware.ros2.dds import Participant, Writer

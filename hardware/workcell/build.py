@@ -25,8 +25,7 @@ import numpy as np
 from hardware.arms.arm import Arm, ArmState, SimulatedArm
 from hardware.arms.motion import turn_between_deg
 from hardware.arms.open_arm import kind_of, open_arm
-from hardware.cameras.choose import open_camera
-from hardware.cameras.source import FrameSource, await_frame
+from hardware.cameras.source import FrameSource, await_frame, open_camera
 from hardware.cameras.twin import PoseSource, TwinCamera, preview_of
 from hardware.errors import DeviceError, leave
 from hardware.rig.geometry import HOLD_DEG, LastAxis, PlacedObject, path_around, shift_in_tool

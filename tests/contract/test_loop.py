@@ -11,7 +11,7 @@ from true_estimator import TrueEstimate, TrueEstimator
 
 from hardware.arms.arm import SimulatedArm
 from hardware.cameras.mjpeg import MjpegCamera
-from hardware.cameras.recorded import SessionSource
+from hardware.cameras.source import SessionSource
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject

@@ -22,7 +22,7 @@ from typer.testing import CliRunner
 
 from hardware.arms.arm import SimulatedArm
 from hardware.cameras.reader import DevicePicture, LiveSource
-from hardware.cameras.recorded import SessionSource
+from hardware.cameras.source import SessionSource
 from hardware.cameras.twin import preview_of
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.faults import Emulator

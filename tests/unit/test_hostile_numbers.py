@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from noisy_camera import NoisyCamera
 
-from hardware.cameras.choose import open_camera
+from hardware.cameras.source import open_camera
 from hardware.collect.collect import CollectPlan
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.magician import MagicianEmulator

@@ -26,7 +26,7 @@ from hardware.arms.arm import Arm, ArmState, SimulatedArm
 from hardware.arms.motion import turn_between_deg
 from hardware.arms.open_arm import kind_of, open_arm
 from hardware.cameras.source import FrameSource, await_frame, open_camera
-from hardware.cameras.twin import PoseSource, TwinCamera, preview_of
+from hardware.cameras.twin import TwinCamera, preview_of
 from hardware.errors import DeviceError, leave
 from hardware.rig.geometry import HOLD_DEG, LastAxis, PlacedObject, path_around, shift_in_tool
 from hardware.safety.decide import Action, Sensed, decide, load_limits
@@ -213,11 +213,6 @@ def open_guarded_arm(arm: str, limits: str | None, *, at_once: bool) -> Arm:
     if kind_of(arm) == "simulated" and limits is None:  # by its name: an arm of another package is guarded, whatever class it has
         return device
     return SafeArm(device, load_limits(limits or kind_of(arm)))
-
-
-def twin_camera(sensor: SensorSpec, placed: PlacedObject, pose: PoseSource, form: Form, *, fps: float, plain_light: bool) -> TwinCamera:
-    """The twin as a camera on an arm that another process runs. If the connection to the arm is lost, the camera waits for it."""
-    return TwinCamera(sensor, placed, pose, form, fps=fps, preview=draw_window(sensor, form, plain_light), waits_for_arm=True)
 
 
 def draw_window(sensor: SensorSpec, form: Form, plain_light: bool) -> Preview:

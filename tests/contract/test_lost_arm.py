@@ -11,8 +11,8 @@ from true_estimator import TrueEstimator
 
 from hardware.cameras.twin import TwinCamera
 from hardware.collect.collect import Collection, collect
+from hardware.emulators.camera import FeedbackPose
 from hardware.emulators.mg400 import Mg400Emulator
-from hardware.emulators.twin_camera import FeedbackPose
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject
 from hardware.safety.decide import SafetyLimits

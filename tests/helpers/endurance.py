@@ -59,18 +59,16 @@ with Mg400Emulator(port_offset=int(sys.argv[1]), time_scale=float(sys.argv[2])) 
 """
 CAMERA = """
 import sys
-from hardware.emulators.camera import CameraEmulator
-from hardware.emulators.twin_camera import FeedbackPose
-from hardware.workcell.build import twin_camera
+from hardware.cameras.twin import TwinCamera
+from hardware.emulators.camera import CameraEmulator, FeedbackPose
 from hardware.rig.geometry import PlacedObject
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.rig.kinematics import Mounting
-from twin.types import Form
 arm, port, sensor, thing, servo, fps = sys.argv[1:]
 spec, how = load_sensor(sensor), load_servo(servo)
 placed = PlacedObject(load_object(thing), how.placement, Mounting.of(spec, load_experiment(how.experiment)))
 with FeedbackPose.of(arm) as pose:
-    source = twin_camera(spec, placed, pose, Form.RAW, fps=float(fps), plain_light=True)
+    source = TwinCamera(spec, placed, pose, fps=float(fps), waits_for_arm=True)
     with CameraEmulator(source, port=int(port)) as camera:
         print("ready", camera.url, flush=True)
         for line in sys.stdin:

@@ -12,10 +12,9 @@ from noisy_camera import NoisyCamera
 
 from hardware.cameras.source import open_camera
 from hardware.collect.collect import CollectPlan
-from hardware.emulators.camera import CameraEmulator
+from hardware.emulators.camera import CameraEmulator, emulate_camera
 from hardware.emulators.magician import MagicianEmulator
 from hardware.emulators.mg400 import Mg400Emulator
-from hardware.emulators.twin_camera import emulate_camera
 from hardware.errors import DeviceError
 from hardware.live.studio_mode import require_feed
 from hardware.safety.decide import load_limits

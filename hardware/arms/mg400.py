@@ -347,14 +347,8 @@ class MG400(KinematicArm):
 
     def _await_mode(self, reached: Callable[[int], bool], otherwise: str) -> None:
         """Wait for feedback newer than this call whose mode is one of the wanted modes."""
-        asked_s = time.monotonic()
-        while True:
-            packet, time_s = self._feedback.newest(SILENCE_S)
-            if time_s > asked_s and reached(int(packet["mode"])):
-                return
-            if time.monotonic() - asked_s > ENABLE_TIMEOUT_S:
-                raise DeviceError(f"{self.name}: {otherwise} (mode {int(packet['mode'])})")
-            time.sleep(POLL_S)
+        if not self._shows(lambda packet: reached(int(packet["mode"])), within_s=ENABLE_TIMEOUT_S):
+            raise DeviceError(f"{self.name}: {otherwise} (mode {self._mode()})")
 
     def _mode(self) -> int:
         return int(self._feedback.newest(SILENCE_S)[0]["mode"])

@@ -18,13 +18,13 @@ from threading import Event, Lock, Thread
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from hardware.arms.motion import MotionTrack, Speeds, Violation
 from hardware.arms.ur.driver import DASHBOARD_PORT, EMERGENCY, IDLE, NORMAL, PAUSED, PLAYING, POWER_OFF, PROTECTIVE, RUNNING, STOPPED
 from hardware.arms.ur.kinematics import UrKinematics, pose_from_ur, pose_to_ur
 from hardware.emulators.faults import SECONDS, SHARE, EmulatedArm, Fault, Faults, PortServer
 from hardware.errors import cannot_listen
+from twin.rig.arm_pose import matrix_of
 
 LOG = logging.getLogger(__name__)
 SCRIPT_PORT, RTDE_PORT = 30003, 30004
@@ -79,8 +79,7 @@ class UrController:
         self.faults, self._scale, self.lock = faults, time_scale, Lock()
         self.kinematics = UrKinematics()
         self.kinematics.near_deg[:] = START_JOINTS_DEG
-        T = self.kinematics.T_flange_tool
-        T[:3, :3], T[:3, 3] = Rotation.from_rotvec(TOOL[3:]).as_matrix(), 1000.0 * np.array(TOOL[:3])
+        self.kinematics.T_flange_tool[:] = matrix_of(pose_from_ur(np.array(TOOL)))
         self.track = MotionTrack(self.kinematics, np.array(START_JOINTS_DEG))
         self.inputs: dict[str, float] = defaultdict(float)
         self.outputs: dict[str, float] = defaultdict(float)

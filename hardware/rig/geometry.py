@@ -62,10 +62,8 @@ class PlacedObject:
 
     def __init__(self, spec: ObjectSpec, placement: PlacementSpec, mounting: Mounting) -> None:
         self.spec, self.mounting = spec, mounting
-        c, s = np.cos(np.radians(placement.turn_deg)), np.sin(np.radians(placement.turn_deg))
-        self.T_base_object = np.eye(4)
-        self.T_base_object[:3, :3] = np.column_stack([[c, s, 0], [0, 0, -1], [-s, c, 0]])
-        self.T_base_object[:3, 3] = placement.position_mm
+        turned = matrix_of(np.array([*placement.position_mm, 0.0, 0.0, placement.turn_deg]))
+        self.T_base_object = turned[:, [0, 2, 1, 3]] * [1, -1, 1, 1]  # its z lies along the turned y, and its y points down
         self._T_tool_sensor = mounting.T_tool_sensor
         self._surface = SmoothSurface(spec)
 
@@ -156,12 +154,9 @@ def _require_in_front(placed: PlacedObject, start: np.ndarray, clear: np.ndarray
 
 def _spun(T: np.ndarray, angle: float, middle: np.ndarray) -> np.ndarray:
     """A pose (4, 4) turned about the vertical through ``middle`` (2,)."""
-    c, s = np.cos(angle), np.sin(angle)
-    turn = np.array([[c, -s], [s, c]])
-    out = T.copy()
-    out[:2, :3] = turn @ T[:2, :3]
-    out[:2, 3] = middle + turn @ (T[:2, 3] - middle)
-    return out
+    turn = matrix_of(np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.degrees(angle)]))
+    turn[:2, 3] = middle - turn[:2, :2] @ middle
+    return turn @ T
 
 
 @dataclass(frozen=True)
@@ -213,8 +208,7 @@ def poses_along(placed: PlacedObject, indent_mm: float, length_mm: float) -> Ite
     for (x, z), angle, distance in zip(outline, angles - angles[0], along, strict=True):
         if distance > length_mm:
             return
-        c, s = np.cos(angle), np.sin(angle)
-        T = np.array([[c, 0, -s, x], [0, 1, 0, 0], [s, 0, c, z], [0, 0, 0, 1.0]])
+        T = matrix_of(np.array([x, 0.0, z, 0.0, -np.degrees(angle), 0.0]))
         yield float(distance), pose_of(placed.T_base_object @ T @ np.linalg.inv(placed.T_base_object) @ first, np.zeros(6))
 
 

@@ -66,15 +66,12 @@ MOST_STEPS = 1_000_000
 
 def policy_law(policy: Policy, mounting: Mounting) -> Callable[[np.ndarray, Estimate], np.ndarray]:
     """Function from the arm's pose (6,) and the policy's answer to a frame to the next pose (6,)."""
-    T_tool_work = np.eye(4)
-    T_tool_work[:3, :3] = mounting.work_axes
 
     def law(pose: np.ndarray, answer: Estimate) -> np.ndarray:
-        step = policy.step(np.asarray(answer.value, float))
-        move = np.eye(4)
-        move[:3, :3] = Rotation.from_rotvec(step[3:], degrees=True).as_matrix()
-        move[:3, 3] = step[:3]
-        return pose_of(matrix_of(pose) @ T_tool_work @ move @ T_tool_work.T, pose)
+        shift, turn = policy.step(np.asarray(answer.value, float)).reshape(2, 3) @ mounting.work_axes.T  # in the tool frame
+        T = matrix_of(shift_in_tool(pose, shift))
+        T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(turn, degrees=True).as_matrix()
+        return pose_of(T, pose)
 
     return law
 

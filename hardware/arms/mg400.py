@@ -188,7 +188,7 @@ class MG400(KinematicArm):
         asked_s, since_s = time.monotonic(), np.inf
         with contextlib.suppress(StaleDataError):
             while time.monotonic() - asked_s < within_s:
-                packet, time_s = self._feedback.newest(SHOWS_S)
+                packet, time_s = self._feedback.newest(SILENCE_S if within_s > SHOWS_S else SHOWS_S)
                 since_s = min(since_s, time_s) if time_s > asked_s and obeyed(packet) else np.inf
                 if time_s - since_s >= RESTED_S:
                     return True

@@ -10,9 +10,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol
 
+from hardware.cameras.devices import FFMPEG, Ros2Camera, UvcCamera, VideoCamera
 from hardware.cameras.mjpeg import MjpegCamera, without_secrets
-from hardware.cameras.ros2 import Ros2Camera
-from hardware.cameras.uvc import FFMPEG, UvcCamera, VideoCamera
 from hardware.errors import Connection, DeviceError
 from scenes.files import LONGEST_PATH, quote
 from scenes.plugins import others

@@ -11,8 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from hardware.rig.geometry import PlacedObject
-from hardware.servo.law import Reading, tangent_of
-from hardware.servo.loop import StepRecord
+from hardware.servo.loop import Reading, StepRecord, tangent_of
 from twin.report.charts import muted_colour, new_figure
 from twin.report.table import write_table
 from twin.report.themes import BLUE, RED

@@ -19,11 +19,11 @@ from noisy_camera import NoisyCamera, number_of
 
 from hardware.arms.arm import SimulatedArm
 from hardware.cameras import reader
+from hardware.cameras.devices import UvcCamera, apply_settings, exposed_s, measure_settings, node_at
 from hardware.cameras.mjpeg import CONTENT_TYPE, MjpegCamera, Parts, jpeg_of, write_part
 from hardware.cameras.reader import FIRST_PERIODS, MOST_FAILED_READS, OUTAGE_PERIODS, ReadFailed
 from hardware.cameras.source import FrameSource, open_camera
 from hardware.cameras.twin import TwinCamera
-from hardware.cameras.uvc import UvcCamera, apply_settings, exposed_s, measure_settings, node_at
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceError, StaleDataError
 from hardware.live.doctor import cameras

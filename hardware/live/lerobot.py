@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hardware.arms.arm import Arm
-from hardware.arms.newest import NewestTarget
+from hardware.arms.arm import Arm, NewestTarget
 from hardware.arms.open_arm import kind_of, open_arm
 from hardware.cameras.source import FrameSource, open_camera
 from hardware.errors import Connection, DeviceError, StaleDataError, leave

@@ -11,12 +11,11 @@ from typing import Self
 
 import numpy as np
 
-from hardware.arms.arm import Arm
+from hardware.arms.arm import Arm, NewestTarget
 from hardware.arms.cri.transforms import Numbers, euler2mat, mat2euler, mat2quat, quat2mat
 from hardware.arms.mg400 import MG400
 from hardware.arms.mg400_wire import DEFAULT_HOSTS, MAX_JOINT_DEG_S, MAX_LINEAR_MM_S
 from hardware.arms.motion import circle, way_between
-from hardware.arms.newest import NewestTarget
 from hardware.arms.open_arm import open_arm
 from hardware.errors import DeviceError, leave, undo
 

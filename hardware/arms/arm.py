@@ -135,6 +135,16 @@ class Arm(Protocol):
         """
 
 
+def happens(condition: Callable[[], object], within_s: float) -> bool:
+    """Whether a condition becomes true in time. It is looked at every ``POLL_S``."""
+    until_s = time.monotonic() + within_s
+    while not condition():
+        if time.monotonic() > until_s:
+            return False
+        time.sleep(POLL_S)
+    return True
+
+
 class BaseArm(Connection):
     """Base class of the arms; see ``hardware.arms.arm.Arm`` for the methods."""
 

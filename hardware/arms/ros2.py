@@ -16,7 +16,7 @@ from threading import Event, Lock, Thread
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, BaseArm
+from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, BaseArm, happens
 from hardware.arms.motion import MotionTrack, Speeds, StageKinematics, finite_numbers
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 from hardware.ros2.dds import Participant, Reader, Writer, domain_id
@@ -103,16 +103,13 @@ class Ros2Arm(BaseArm):
         given = (participant.reader(pose, POSE), participant.reader(joints, JOINTS), writer, self._end)
         self._thread = Thread(target=self._run, args=given, daemon=True, name="ROS 2 arm")
         self._thread.start()
-        until_s = time.monotonic() + CONNECT_S
-        while not (self._pose_s > 0 < self._joints_s and writer.heard):
-            if time.monotonic() > until_s:
-                self._close()
-                raise DeviceNotConnectedError(
-                    f"{self.name}: not found in domain {domain_id()}: it needs poses on {pose}, {self.axes} joints on {joints}, and a node "
-                    f"that takes {self._kind} on {command}; start them, or name other topics ({ARM_FORM}); without an arm: "
-                    f"'twin emulate ros2'. There are: {', '.join(participant.topics()) or 'no topics'}"
-                )
-            time.sleep(POLL_S)
+        if not happens(lambda: self._pose_s > 0 < self._joints_s and writer.heard, CONNECT_S):
+            self._close()
+            raise DeviceNotConnectedError(
+                f"{self.name}: not found in domain {domain_id()}: it needs poses on {pose}, {self.axes} joints on {joints}, and a node "
+                f"that takes {self._kind} on {command}; start them, or name other topics ({ARM_FORM}); without an arm: "
+                f"'twin emulate ros2'. There are: {', '.join(participant.topics()) or 'no topics'}"
+            )
         self._writer = writer
         LOG.warning("%s: the network guarantees nothing and no emergency stop is behind it; keep a hand at the arm's own", self.name)
 
@@ -157,13 +154,11 @@ class Ros2Arm(BaseArm):
         with self._lock:
             if not self._fault:  # which held it
                 self._hold()
-        asked_s, until_s = time.monotonic(), time.monotonic() + STOPS_S
+        asked_s = time.monotonic()
         why = "can't be stopped and may move. Press its emergency stop"
         with ErrorsAs(DeviceError, lambda error: type(error)(f"{self.name}: {why}. {error}")):
-            while self.state(max_age_s=SILENCE_S).time_s - max(self._rest_s, asked_s) < REST_S:
-                if time.monotonic() > until_s:
-                    raise DeviceError(f"It moves {STOPS_S:g} s after a stop")
-                time.sleep(POLL_S)
+            if not happens(lambda: self.state(max_age_s=SILENCE_S).time_s - max(self._rest_s, asked_s) >= REST_S, STOPS_S):
+                raise DeviceError(f"It moves {STOPS_S:g} s after a stop")
         self._unstopped = False
 
     def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState:

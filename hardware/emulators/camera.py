@@ -204,5 +204,6 @@ def emulate_camera(
     placed = PlacedObject(obj, servo.placement, Mounting.of(sensor, load_experiment(servo.experiment)))
     pose = FeedbackPose.of(arm)
     source = TwinCamera(sensor, placed, pose, fps=fps, preview=draw_window(sensor, Form.RAW, plain_light), waits_for_arm=True)
+    device = CameraEmulator(source, host=host, port=port, faults=faults)
     with pose:
-        CameraEmulator(source, host=host, port=port, faults=faults).run()
+        device.run()

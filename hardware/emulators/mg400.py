@@ -12,6 +12,7 @@ from threading import Event
 import numpy as np
 
 from hardware.arms import mg400_wire as wire
+from hardware.arms.arm import happens
 from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, EmulatedArm, Fault, PortServer, Range
 from hardware.emulators.mg400_commands import Mg400Commands, Request, parse_firmware, take_request
 from hardware.emulators.mg400_controller import START_JOINTS_DEG, Mg400Controller, PlanarFrame, RefusedError, refuse_if
@@ -208,10 +209,8 @@ class Mg400Emulator(EmulatedArm):
     def _execute(self, port: int, request: Request) -> str:
         refuse_if("no-tcp-mode" in self.faults)
         if "needs-motion-client" in self.faults or "motion-port-closed" in self.faults:
-            motion, until_s = self._servers[wire.MOTION_PORT], time.monotonic() + ACCEPTS_S
-            while not motion.clients and time.monotonic() < until_s:
-                time.sleep(POLL_S)
-            refuse_if(not motion.clients, wire.ErrorId.NO_SUCH_COMMAND)
+            there = happens(lambda: self._servers[wire.MOTION_PORT].clients, ACCEPTS_S)
+            refuse_if(not there, wire.ErrorId.NO_SUCH_COMMAND)
         commands = self._commands.dashboard if port == wire.DASHBOARD_PORT else self._commands.motion
         refuse_if(request.name not in commands, wire.ErrorId.NO_SUCH_COMMAND)
         with self.arm.lock:

@@ -156,10 +156,8 @@ class LiveSession:
     count: int = 0
     valid: int = 0
     invalid: str = ""
-    _ages: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
-    _late: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
-    _spent: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
-    _done: deque[float] = field(default_factory=lambda: deque(maxlen=RATE_SPAN))
+    # ages of the frames when they were taken and when their estimates were made (NaN for a recording), times spent, and ends
+    _times: deque[tuple[float, float, float, float]] = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
     _begun_s: float = field(default_factory=time.monotonic)
 
     def run(
@@ -189,12 +187,8 @@ class LiveSession:
             taken_s = time.monotonic()
             with ErrorsAs(FrameError, lambda error: FrameError(f"{self.source.name}: {error}")):
                 estimate = self.estimator(frame)
-            now_s = time.monotonic()
-            if self.source.is_live:
-                self._ages.append(taken_s - frame.time_s)
-                self._late.append(now_s - frame.time_s)
-            self._spent.append(now_s - taken_s)
-            self._done.append(now_s)
+            now_s, exposed_s = time.monotonic(), frame.time_s if self.source.is_live else np.nan
+            self._times.append((taken_s - exposed_s, now_s - exposed_s, now_s - taken_s, now_s))
             self.count += 1
             self.valid += estimate.valid
             self.invalid = self.invalid if estimate.valid else estimate.reason
@@ -208,7 +202,7 @@ class LiveSession:
     def timing(self) -> Timing:
         """The figures so far."""
         rate_hz = self.count / max(time.monotonic() - self._begun_s, 1e-9)
-        late, ages, spent = (TimeSpread.of(list(times)) for times in (self._late, self._ages, self._spent))
+        ages, late, spent, _ = map(TimeSpread.of, np.reshape(self._times, (-1, 4)).T.tolist())
         return Timing(self.count, rate_hz, rate_hz, late, ages, spent, self.source.dropped)
 
     def lines(self, estimate: Estimate) -> list[str]:
@@ -218,9 +212,10 @@ class LiveSession:
             pose = [f"{name} {value:+.2f} [{low:+.2f}, {high:+.2f}]" for name, value, low, high in rows]
         else:
             pose = [f"not valid: {estimate.reason}"]
-        done = list(self._done)
+        times = list(self._times)
+        done = [end_s for *_, end_s in times[-RATE_SPAN:]]
         now_hz = (len(done) - 1) / (done[-1] - done[0]) if len(done) > 1 and done[-1] > done[0] else 0.0
-        late = f", exposure to pose {1e3 * float(np.median(self._late)):.0f} ms" if self._late else ""
+        late = f", exposure to pose {1e3 * np.median([late_s for _, late_s, *_ in times]):.0f} ms" if times and self.source.is_live else ""
         return ["   ".join(pose), f"{now_hz:.1f} frames/s, {format_count(self.count, 'frames')}, {self.source.dropped} dropped{late}"]
 
 
@@ -448,7 +443,7 @@ def watch(
             about = {"sensor": model.sensor.name, "form": str(source.form), "camera": source.name, "model": name}
             stack.enter_context(output(plan.record, *SESSION_FILES))
             stack.enter_context(kept)
-            stack.callback(_catch_up, session, kept)
+            stack.callback(lambda: session.count and kept.catch_up())  # however it ended
             session.record = stack.enter_context(SessionWriter(plan.record, about))
             if rest is not None:
                 session.record.keep_rest(rest)
@@ -459,12 +454,6 @@ def watch(
             interrupted = True
         same = (same_estimates(source.session.steps, found), len(found)) if isinstance(source, SessionSource) else None
         return WatchResult(session.timing(), interrupted, same, plan.record, session.count, source.notes(), session.valid, session.invalid)
-
-
-def _catch_up(session: LiveSession, kept: KeptAlso) -> None:
-    """Write a session with at least one step in the further formats, however it ended."""
-    if session.count:
-        kept.catch_up()
 
 
 def _at_rest(plan: WatchPlan, model: SensorModel, source: FrameSource, rest: Frame | None) -> tuple[SensorModel, Frame | None]:

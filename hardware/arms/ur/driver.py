@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, KinematicArm
+from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, KinematicArm, happens
 from hardware.arms.motion import LIMIT_TOLERANCE_DEG, TARGET_LIMIT, OutOfReachError, StageKinematics, Violation, way_between
 from hardware.arms.ur.client import CONNECT_S, WATCHDOG_HZ, ClientProcess
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
@@ -310,14 +310,9 @@ class UR(KinematicArm):
 
     def _end_program(self) -> bool:
         """End the control program over the dashboard; returns whether the controller says that none runs."""
-        until_s = time.monotonic() + STOP_S
         with contextlib.suppress(DeviceError):
             self._tell("stop")
-            while self._tell("running").lower() != "program running: false":
-                if time.monotonic() > until_s:
-                    return False
-                time.sleep(POLL_S)
-            return True
+            return happens(lambda: self._tell("running").lower() == "program running: false", STOP_S)
         return False
 
     def _ask(self, method: str, *arguments: Any, timeout_s: float = REPLY_S) -> Any:

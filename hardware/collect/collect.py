@@ -217,7 +217,6 @@ def collect(
     seed: int,
     design: str = "random",
     speed: tuple[float, float],
-    frame_timeout_s: float | None = None,
     on_rest: Callable[[Frame], None] | None = None,
     progress: Step = unheard,
 ) -> int:
@@ -237,8 +236,6 @@ def collect(
         See ``draw_contact``.
     speed : (float, float)
         Speed of the arm in mm/s and deg/s.
-    frame_timeout_s : float, optional
-        Longest wait in s for a frame while the arm stands still. By default that of the rig.
     on_rest : callable, optional
         Called with the frame without contact after it was kept.
     progress : Step, optional
@@ -260,7 +257,7 @@ def collect(
         raise DeviceError(f"{experiment.name}: its tap follows the tool's axes, but a collection taps along the work frame's; give another")
     if not rig.source.is_live:
         raise DeviceError(f"{rig.source.name}: a recording does not show this arm; give a live `camera`")
-    timeout_s = rig.frame_timeout_s if frame_timeout_s is None else frame_timeout_s
+    timeout_s = rig.frame_timeout_s
     stops = _Stops(Mover(rig, speed, clear_mm=CLEAR_MM, patience_s=timeout_s), WorkFrame(experiment, rig.placed), timeout_s)
     with output(collection.folder), stops.mover.watching():
         at_object = False

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from serial.tools import list_ports
 
-from hardware.cameras.devices import PICTURES, SYSFS_CAMERAS, port_of
+from hardware.cameras.source import PICTURES, SYSFS_CAMERAS, port_of
 from hardware.errors import DeviceError
 from hardware.ros2.dds import Participant
 from scenes import list_specifications

@@ -33,10 +33,9 @@ class StaleDataError(DeviceError):
 
 def cannot_listen(who: str, host: str, port: int, error: OSError, *, option: str = "`port`") -> DeviceError:
     """The error of a server that can't listen. It names the address, the reason and the remedy; ``option`` is the option for the port."""
-    foreign = isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL
-    remedy = (
-        "give an address of this machine with `host`, such as 127.0.0.1" if foreign else f"end what uses the port, or give another {option}"
-    )
+    remedy = f"end what uses the port, or give another {option}"
+    if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+        remedy = "give an address of this machine with `host`, such as 127.0.0.1"
     return DeviceError(f"{who}: can't listen on {host}:{port} ({error.strerror}); {remedy}")
 
 

@@ -186,15 +186,12 @@ class BaseArm(Connection):
                 return state
             rest_since = (rest_since or state.time_s) if known and not state.moving else None
             if rest_since is not None and state.time_s - rest_since > min(max(BELIEVE_REST_S, 0.1 * timeout_s), MOST_REST_S):
-                raise DeviceError(
-                    f"{self.name}: at rest {off_mm:.2f} mm and {off_deg:.2f} deg from the commanded pose; the move was not executed. "
-                    "Check for a stop button, a brake or an obstacle, call clear_error(), then move again"
-                )
+                rests = f"at rest {off_mm:.2f} mm and {off_deg:.2f} deg from the commanded pose; the move was not executed"
+                remedy = "Check for a stop button, a brake or an obstacle, call clear_error(), then move again"
+                raise DeviceError(f"{self.name}: {rests}. {remedy}")
             if time.monotonic() > deadline:
-                raise DeviceError(
-                    f"{self.name}: not there after {timeout_s:g} s ({off_mm:.2f} mm and {off_deg:.2f} deg left) and stopped; allow more "
-                    "time or more speed"
-                )
+                late = f"not there after {timeout_s:g} s ({off_mm:.2f} mm and {off_deg:.2f} deg left) and stopped"
+                raise DeviceError(f"{self.name}: {late}; allow more time or more speed")
             time.sleep(POLL_S)
 
     @contextmanager
@@ -238,10 +235,8 @@ class BaseArm(Connection):
             raise failed
 
     def _too_long(self, timeout_s: float) -> DeviceError:
-        return DeviceError(
-            f"{self.name}: the move did not end within {timeout_s:g} s and was stopped; allow more time or more speed, or look for an "
-            "obstacle"
-        )
+        remedy = "allow more time or more speed, or look for an obstacle"
+        return DeviceError(f"{self.name}: the move did not end within {timeout_s:g} s and was stopped; {remedy}")
 
     def _require_speeds(self, linear_mm_s: float, angular_deg_s: float) -> None:
         self._require_connected()

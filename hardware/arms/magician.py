@@ -85,11 +85,10 @@ class Magician(KinematicArm):
         try:
             self._serial = serial.Serial(self._port_name, BAUD, timeout=0.05, write_timeout=REPLY_TIMEOUT_S, exclusive=True)
         except PORT_ERRORS as error:
-            raise DeviceNotConnectedError(
-                f"{self.name}: can't open the port ({error}); Magicians attached: {', '.join(attached_ports()) or 'none'}. Plug in the USB "
-                "cable and switch the arm on; on Linux the user must be in the group 'dialout'; and no other program may hold the port; "
-                "without an arm: 'twin emulate magician'"
-            ) from error
+            there = f"Magicians attached: {', '.join(attached_ports()) or 'none'}. Plug in the USB cable and switch the arm on"
+            remedy = "on Linux the user must be in the group 'dialout'; and no other program may hold the port"
+            emulated = "without an arm: 'twin emulate magician'"
+            raise DeviceNotConnectedError(f"{self.name}: can't open the port ({error}); {there}; {remedy}; {emulated}") from error
         try:
             self._buffer = b""
             self._request(Id.GET_POSE)
@@ -229,15 +228,11 @@ class Magician(KinematicArm):
                     continue
                 except PORT_ERRORS as error:
                     self._close()
-                    self._lost = (
-                        f"{self.name}: the port vanished ({error}). The arm executes the moves in its queue: switch it off if it moves! "
-                        "Plug the cable in, then connect() again"
-                    )
+                    moves = "The arm executes the moves in its queue: switch it off if it moves! Plug the cable in, then connect() again"
+                    self._lost = f"{self.name}: the port vanished ({error}). {moves}"
                     raise DeviceNotConnectedError(self._lost) from error
-        raise DeviceError(
-            f"{self.name}: no valid reply to command {int(id)} in {tries} tries of {REPLY_TIMEOUT_S:g} s; switch the arm on, "
-            "check that the port is a Magician's and the cable is sound"
-        )
+        remedy = "switch the arm on, check that the port is a Magician's and the cable is sound"
+        raise DeviceError(f"{self.name}: no valid reply to command {int(id)} in {tries} tries of {REPLY_TIMEOUT_S:g} s; {remedy}")
 
     def _port(self) -> serial.Serial:
         """The open port; ``DeviceNotConnectedError`` where there is none."""
@@ -263,10 +258,8 @@ class Magician(KinematicArm):
             message, self._buffer = take_message(self._buffer)
             while message is not None:
                 if (message.id, message.ctrl) == (id, ctrl) and wanted not in (None, len(message.params)):
-                    raise DeviceError(
-                        f"{self.name}: replied {len(message.params)} bytes to command {int(id)} instead of {wanted}: the device echoes its "
-                        "input, or is no Magician. Give the port of the arm"
-                    )
+                    said = f"replied {len(message.params)} bytes to command {int(id)} instead of {wanted}"
+                    raise DeviceError(f"{self.name}: {said}: the device echoes its input, or is no Magician. Give the port of the arm")
                 if (message.id, message.ctrl) == (id, ctrl):
                     return message
                 message, self._buffer = take_message(self._buffer)

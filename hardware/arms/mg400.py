@@ -135,9 +135,8 @@ class MG400(KinematicArm):
         if self._mode() == wire.Mode.ERROR:
             raise DeviceError(f"{self.name}: {self._alarm()}")
         if self._mode() in ENABLED_MODES and not self._enabled:
-            LOG.warning(
-                "%s: is enabled already, so another program may use it; a stop or disable of one program is one for both", self.name
-            )
+            shared = "is enabled already, so another program may use it; a stop or disable of one program is one for both"
+            LOG.warning("%s: %s", self.name, shared)
         if self._supervised and not self._enabled:
             self._dashboard.supervise(*LAST_WORDS)
         with self._watch_enabling():
@@ -178,9 +177,8 @@ class MG400(KinematicArm):
                     self.emergency_stop()
                 except DeviceError:
                     raise error from None
-                raise DeviceError(
-                    f"{self.name}: did not stop, so its emergency stop was used; call clear_error() and enable(). {error}"
-                ) from error
+                remedy = "call clear_error() and enable()"
+                raise DeviceError(f"{self.name}: did not stop, so its emergency stop was used; {remedy}. {error}") from error
         self._unstopped = self._under_way = False
 
     def _shows(self, obeyed: Callable[[np.void], bool], *, within_s: float = SHOWS_S) -> bool:

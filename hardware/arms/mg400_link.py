@@ -58,11 +58,9 @@ class CommandPort:
             self._socket = socket.create_connection(self._address, timeout_s)
         except OSError as error:
             host, port = self._address
-            raise DeviceNotConnectedError(
-                f"{self._name}: no connection to {host}:{port} ({error.strerror or error}). Check that the arm is on, that this machine "
-                f"has an address in its network ('ping {host}') and that no other program holds the port; without an arm: "
-                "'twin emulate mg400' and mg400:127.0.0.1"
-            ) from error
+            check = f"Check that the arm is on, that this machine has an address in its network ('ping {host}')"
+            remedy = f"{check} and that no other program holds the port; without an arm: 'twin emulate mg400' and mg400:127.0.0.1"
+            raise DeviceNotConnectedError(f"{self._name}: no connection to {host}:{port} ({error.strerror or error}). {remedy}") from error
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.supervise(*self._last_words)
 
@@ -105,9 +103,8 @@ class CommandPort:
             came = self._buffer
         host, port = self._address
         instead = f", {describe_bytes(came.encode('ascii', errors='replace'))} came instead: is this an MG400?" if came else ""
-        raise NoReplyError(
-            f"{self._name}: no reply to {text} from {host}:{port} within {timeout_s:g} s{instead}; check the arm, then connect again"
-        )
+        late = f"no reply to {text} from {host}:{port} within {timeout_s:g} s"
+        raise NoReplyError(f"{self._name}: {late}{instead}; check the arm, then connect again")
 
     def send(self, text: str) -> None:
         """Send one command; its reply is read by ``poll``."""
@@ -154,13 +151,11 @@ class CommandPort:
         reason = f" ({error.strerror or error})" if error else ""
         if came and came.lstrip()[:1] not in "-0123456789":  # it can't be the beginning of a reply
             said, (host, port) = describe_bytes(came.encode("ascii", errors="replace")), self._address
-            raise DeviceNotConnectedError(
-                f"{self._name}: {said} came from {host}:{port}: this is no MG400. Check address and port"
-            ) from error
+            strange = f"{said} came from {host}:{port}: this is no MG400. Check address and port"
+            raise DeviceNotConnectedError(f"{self._name}: {strange}") from error
         why = "Check its power and cable" if self._heard else "Another program may hold it (DobotStudio Pro, a script): close that"
-        raise DeviceNotConnectedError(
-            f"{self._name}: the arm closed the connection{reason}. {why}, then disconnect() and connect() again"
-        ) from error
+        lost = f"the arm closed the connection{reason}. {why}, then disconnect() and connect() again"
+        raise DeviceNotConnectedError(f"{self._name}: {lost}") from error
 
 
 class Feedback:
@@ -228,10 +223,8 @@ class Feedback:
                 self._arrived.wait(STALL_CHECK_S)
         age_s = np.inf if newest is None else time.monotonic() - newest[1]
         if newest is None or age_s > max_age_s:
-            raise StaleDataError(
-                f"{self._name}: no feedback for {age_s:.1f} s (allowed {max_age_s:g} s); the reader keeps trying to reconnect. "
-                "Don't trust the last pose: stop, check the cable, then go on"
-            )
+            remedy = "the reader keeps trying to reconnect. Don't trust the last pose: stop, check the cable, then go on"
+            raise StaleDataError(f"{self._name}: no feedback for {age_s:.1f} s (allowed {max_age_s:g} s); {remedy}")
         return newest
 
     def _connect(self) -> socket.socket:
@@ -241,10 +234,9 @@ class Feedback:
                 return socket.create_connection((self._host, port), CONNECT_TIMEOUT_S)
             except OSError as error:
                 errors.append(f"{port}: {error.strerror or error}")
-        raise DeviceNotConnectedError(
-            f"{self._name}: no feedback port of {self._host} takes connections ({'; '.join(errors)}); check that it is on (without "
-            "an arm: 'twin emulate mg400'), and close other programs that use the arm"
-        )
+        remedy = "check that it is on (without an arm: 'twin emulate mg400'), and close other programs that use the arm"
+        deaf = f"no feedback port of {self._host} takes connections ({'; '.join(errors)})"
+        raise DeviceNotConnectedError(f"{self._name}: {deaf}; {remedy}")
 
     def _read_loop(self, connection: socket.socket, ended: Event) -> None:
         while not ended.is_set():

@@ -38,9 +38,8 @@ def require_ports(offset: int) -> None:
     """``DeviceError`` if the arm's ports plus the offset are not valid ports."""
     lowest, highest = DASHBOARD_PORT + offset, max(FEEDBACK_PERIOD_S) + offset
     if lowest < 1 or highest > LARGEST_PORT:
-        raise DeviceError(
-            f"mg400: no ports {lowest} to {highest}; give a dashboard port (29999 + the offset) between 1 and {LARGEST_PORT - 7}"
-        )
+        remedy = f"give a dashboard port (29999 + the offset) between 1 and {LARGEST_PORT - 7}"
+        raise DeviceError(f"mg400: no ports {lowest} to {highest}; {remedy}")
 
 
 class ErrorId(IntEnum):
@@ -221,13 +220,9 @@ def why_no_packet(came: bytes, *, closed: bool) -> str:
         )
     packet, _ = newest_packet(came, lenient=True)
     if packet is not None:
-        return (
-            f"packets came whose test value is {int(packet['test_value']):#x} instead of {TEST_VALUE:#x}: an emulator, or a controller of "
-            "another kind. If their poses can be trusted, use it as 'mg400-lenient:ADDRESS'"
-        )
+        remedy = "an emulator, or a controller of another kind. If their poses can be trusted, use it as 'mg400-lenient:ADDRESS'"
+        return f"packets came whose test value is {int(packet['test_value']):#x} instead of {TEST_VALUE:#x}: {remedy}"
     if describe_bytes(came).startswith("the text"):
         return f"{describe_bytes(came)} came instead of feedback: this is no MG400. Check address and port"
-    return (
-        f"{describe_bytes(came)} came, and no packet of {PACKET_BYTES} bytes: its firmware or the arm may be of "
-        f"another kind. Check the address"
-    )
+    remedy = "its firmware or the arm may be of another kind. Check the address"
+    return f"{describe_bytes(came)} came, and no packet of {PACKET_BYTES} bytes: {remedy}"

@@ -60,8 +60,7 @@ def kind_of(spec: str) -> str:
 def _attached_magician() -> str:
     found = attached_ports()
     if len(found) != 1:
-        raise DeviceError(
-            f"{'no' if not found else len(found)} serial adapters of a Magician's kind ({', '.join(USB_VENDORS.values())}) are attached: "
-            f"{', '.join(found) or 'plug in its USB cable'}; name one, for example magician:/dev/ttyUSB0"
-        )
+        adapters = f"{len(found) or 'no'} serial adapters of a Magician's kind ({', '.join(USB_VENDORS.values())})"
+        there = ", ".join(found) or "plug in its USB cable"
+        raise DeviceError(f"{adapters} are attached: {there}; name one, for example magician:/dev/ttyUSB0")
     return found[0]

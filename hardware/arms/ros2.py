@@ -164,14 +164,11 @@ class Ros2Arm(BaseArm):
     def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState:
         """See ``Arm``. It moves if its poses show that, or until it has reached the end of the path."""
         self._require_connected()
-        asked_s = time.monotonic()
-        while (age_s := time.monotonic() - self._pose_s) > max_age_s and time.monotonic() - asked_s < 5 * PERIOD_S:
-            time.sleep(POLL_S)  # after a stall of this process
-        if age_s > max_age_s:
-            raise StaleDataError(
-                f"{self.name}: newest pose is {age_s:.1f} s old (allowed {max_age_s:g} s). Don't trust it: stop the arm, check its node "
-                "and the network, then disconnect() and connect() again"
-            )
+        # after a stall of this process it waits for what arrived meanwhile
+        if not happens(lambda: time.monotonic() - self._pose_s <= max_age_s, 5 * PERIOD_S):
+            old = f"newest pose is {time.monotonic() - self._pose_s:.1f} s old (allowed {max_age_s:g} s)"
+            remedy = "stop the arm, check its node and the network, then disconnect() and connect() again"
+            raise StaleDataError(f"{self.name}: {old}. Don't trust it: {remedy}")
         with self._lock:
             self._require_possible(self._pose)
             moving = self._going or self._pose_s - self._rest_s < REST_S
@@ -190,9 +187,8 @@ class Ros2Arm(BaseArm):
                     raise DeviceError(f"{self.name}: {self._fault or 'not enabled'}; call clear_error() and enable()")
                 if not self._going:
                     self._hold()
-                self._track.move(
-                    sent, Speeds(self._speed[0], self._speed[1], ACCELERATION, ACCELERATION), linear=True, now_s=time.monotonic()
-                )
+                speeds = Speeds(*self._speed, ACCELERATION, ACCELERATION)
+                self._track.move(sent, speeds, linear=True, now_s=time.monotonic())
                 self._going = True
             if wait:
                 self._wait_until_settled(sent, timeout_s=timeout_s)

@@ -88,10 +88,8 @@ class Faults:
         """
         name, _, value = text.partition("=")
         if name not in self.known:
-            close = get_close_matches(name, self.known, n=1)
-            raise TwinError(
-                f"no fault '{quote(name)}'{f' (did you mean {close[0]}?)' if close else ''}; there are: {', '.join(self.known)}"
-            )
+            meant = "".join(f" (did you mean {close}?)" for close in get_close_matches(name, self.known, n=1))
+            raise TwinError(f"no fault '{quote(name)}'{meant}; there are: {', '.join(self.known)}")
         fault = self.known[name]
         if fault.allowed is None and value:
             raise TwinError(f"fault '{quote(text)}': {name} is a switch and takes no value; give {name} alone")

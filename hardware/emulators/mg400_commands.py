@@ -163,9 +163,8 @@ def keyword_number(request: Request, key: str, parameter: Parameter, default: fl
 def _number(text: str, parameter: Parameter, n: int) -> float:
     with ErrorsAs(ValueError, lambda error: RefusedError(ErrorId.PARAMETER_TYPE - n)):
         number = int(text) if parameter.integer else float(text)
-    refuse_if(
-        not (parameter.low <= number <= parameter.high and math.isfinite(number)), ErrorId.PARAMETER_RANGE - n
-    )  # a whole number may be too large for isfinite
+    # the range comes first, because a whole number may be too large for isfinite
+    refuse_if(not (parameter.low <= number <= parameter.high and math.isfinite(number)), ErrorId.PARAMETER_RANGE - n)
     return max(-parameter.most, min(number, parameter.most))
 
 
@@ -339,9 +338,8 @@ class Mg400Commands:
         return _text(self._frame("user", user).inverse() @ flange @ self._frame("tool", tool))
 
     def _inverse(self, request: Request) -> str:
-        refuse_if(
-            len(request.values) not in (6, 7, 8), ErrorId.PARAMETER_COUNT
-        )  # two optional parameters select the solution near given joints; here there is only one
+        # two optional parameters select the solution near given joints; here there is only one
+        refuse_if(len(request.values) not in (6, 7, 8), ErrorId.PARAMETER_COUNT)
         *pose, user, tool = read_numbers(replace(request, values=request.values[:6]), PLACE_IN_FRAMES, (6,))
         joints = self.arm.joints_at(self._frame("user", user) @ PlanarFrame(*pose) @ self._frame("tool", tool).inverse())
         refuse_if(self.arm.kinematics.violation(joints))
@@ -362,10 +360,8 @@ class Mg400Commands:
         """Share of the path at which an output is set, its index and its level."""
         mode, distance, index, level = read_table(text, (4,), n)
         share = distance / 100.0 if mode == 0 else distance / max(length_mm, 1e-9)
-        refuse_if(
-            mode not in (0, 1) or not -1.0 <= share <= 1.0 or not OUTPUT.low <= index <= OUTPUT.high or level not in (0, 1),
-            ErrorId.PARAMETER_RANGE - n,
-        )
+        within = mode in (0, 1) and -1.0 <= share <= 1.0 and OUTPUT.low <= index <= OUTPUT.high and level in (0, 1)
+        refuse_if(not within, ErrorId.PARAMETER_RANGE - n)
         return share if share >= 0 else 1.0 + share, int(index), int(level)
 
     def _arc(self, request: Request) -> None:

@@ -146,10 +146,9 @@ def _require_in_front(placed: PlacedObject, start: np.ndarray, clear: np.ndarray
     samples = max(2, int(np.ceil(np.linalg.norm(ends[1] - ends[0]) / SAMPLE_MM)))
     gap_mm = min(placed.distance_mm(ends[0] + share * (ends[1] - ends[0])) for share in np.linspace(0.0, 1.0, samples))
     if gap_mm < 0.0:
-        raise DeviceError(
-            f"the straight path to the {placed.spec.name} leads {-gap_mm:.0f} mm behind its surface, whose extent is not known; jog the "
-            "arm to the side from which the sensor is to touch it, or correct the object's place ('placement' in the file for `servo`)"
-        )
+        way = f"the straight path to the {placed.spec.name} leads {-gap_mm:.0f} mm behind its surface, whose extent is not known"
+        place = "correct the object's place ('placement' in the file for `servo`)"
+        raise DeviceError(f"{way}; jog the arm to the side from which the sensor is to touch it, or {place}")
 
 
 def _spun(T: np.ndarray, angle: float, middle: np.ndarray) -> np.ndarray:

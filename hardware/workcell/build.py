@@ -285,10 +285,8 @@ def check_plan(
     way = [state.pose, *path_around(rig.placed, state.pose, clear), planned[0]]
     for start, end in pairwise(way):
         if why := _forbidden(rig.arm, start, end):
-            raise DeviceError(
-                f"{rig.arm.name}: the limits forbid the path to the {rig.placed.spec.name}: {why}; correct 'placement' in the file for "
-                "`servo` (a Magician reaches that of `servo=magician`), or `safety`"
-            )
+            remedy = "correct 'placement' in the file for `servo` (a Magician reaches that of `servo=magician`), or `safety`"
+            raise DeviceError(f"{rig.arm.name}: the limits forbid the path to the {rig.placed.spec.name}: {why}; {remedy}")
     blocked = [n for n, pose in enumerate(planned) if not _can_retreat(rig, pose)]
     if blocked[:1] == [0]:
         raise DeviceError(f"{rig.arm.name}: the limits allow no path back from the start; correct 'placement' in the file for `servo`")
@@ -468,10 +466,8 @@ class Mover:
             return pose
         turned = self.axis.turned_back(here, target)
         if turned is None:
-            raise DeviceError(
-                f"{self.arm.name}: its last axis can't turn the sensor that far, {held_deg:.0f} deg are missing; turn the object "
-                "('placement.turn_deg' in a file for `servo`), or give no more `steps` than were made"
-            )
+            remedy = "turn the object ('placement.turn_deg' in a file for `servo`), or give no more `steps` than were made"
+            raise DeviceError(f"{self.arm.name}: its last axis can't turn the sensor that far, {held_deg:.0f} deg are missing; {remedy}")
         for share in (1 / 3, 2 / 3, 1.0):  # each part is less than half a turn, so that its direction is unambiguous
             self.go(here + share * (turned - here))
         return self.axis.on_turn(target, turned[5])[0]

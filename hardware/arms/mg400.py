@@ -12,7 +12,7 @@ from hardware.arms import mg400_wire as wire
 from hardware.arms import motion
 from hardware.arms.arm import POLL_S, ArmState, KinematicArm
 from hardware.arms.dobot_alarms import explain
-from hardware.arms.mg400_link import REPLY_TIMEOUT_S, SILENCE_S, CommandPort, Feedback, NoReplyError
+from hardware.arms.mg400_wire import REPLY_TIMEOUT_S, SILENCE_S, CommandPort, Feedback, NoReplyError
 from hardware.arms.motion import LinkageKinematics
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
@@ -206,14 +206,8 @@ class MG400(KinematicArm):
         mode = int(packet["mode"])
         if mode != wire.Mode.ERROR:
             self._alarm_text = None
-        return ArmState(
-            pose,
-            packet["q_actual"][:4].copy(),
-            time_s,
-            mode in ENABLED_MODES,
-            mode in MOVING_MODES or (self._lenient and time.monotonic() - self._feedback.turned_s < RESTED_S),
-            self._trouble(mode),
-        )
+        moving = mode in MOVING_MODES or (self._lenient and time.monotonic() - self._feedback.turned_s < RESTED_S)
+        return ArmState(pose, packet["q_actual"][:4].copy(), time_s, mode in ENABLED_MODES, moving, self._trouble(mode))
 
     def _trouble(self, mode: int) -> str:
         """The arm's fault in a mode, in words; "" if there is none."""

@@ -10,8 +10,7 @@ import time
 import numpy as np
 
 from hardware.arms.arm import ArmState
-from hardware.arms.mg400_link import Feedback
-from hardware.arms.mg400_wire import FEEDBACK_PERIOD_S, address_of, pose_in
+from hardware.arms.mg400_wire import FEEDBACK_PERIOD_S, Feedback, address_of, pose_in
 from hardware.cameras.mjpeg import STREAM, WAIT_S, JpegServer, StreamPart, jpeg_of
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.cameras.twin import TwinCamera

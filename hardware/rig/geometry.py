@@ -12,8 +12,7 @@ import numpy as np
 
 from hardware.arms.motion import Kinematics, LinkageKinematics
 from hardware.errors import DeviceError
-from scenes.object import ObjectSpec
-from scenes.servo import PlacementSpec
+from scenes import ObjectSpec, PlacementSpec
 from twin.rig.arm_pose import matrix_of, pose_of
 from twin.rig.kinematics import Mounting
 from twin.rig.touch import SmoothSurface, TrueTouch

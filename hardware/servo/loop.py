@@ -351,18 +351,12 @@ class ServoLoop:
         """Figures of the steps so far."""
         fresh = [record for record in self.records if record.fresh]
         spent_s = max(self._ended_s - self._started_s, 1e-9)
-        return Timing(
-            len(self.records),
-            len(self.records) / spent_s,
-            len(fresh) / spent_s,
-            TimeSpread.of([record.latency_s for record in fresh]),
-            TimeSpread.of([age_s for _, age_s in self.decided if np.isfinite(age_s)]),
-            TimeSpread.of([record.compute_s for record in fresh]),
-            self.source.dropped,
-            len(self.decided) / spent_s,
-            {str(code): count for code in Decided if (count := sum(one is code for one, _ in self.decided))},
-            self.source.notes(),
-        )
+        rate_hz, fresh_hz, decided_hz = (len(made) / spent_s for made in (self.records, fresh, self.decided))
+        latency, compute = (TimeSpread.of([getattr(record, key) for record in fresh]) for key in ("latency_s", "compute_s"))
+        age = TimeSpread.of([age_s for _, age_s in self.decided if np.isfinite(age_s)])
+        decided = {str(code): count for code in Decided if (count := sum(one is code for one, _ in self.decided))}
+        dropped, notes = self.source.dropped, self.source.notes()
+        return Timing(len(self.records), rate_hz, fresh_hz, latency, age, compute, dropped, decided_hz, decided, notes)
 
     def _follow(self) -> None:
         """Take frames and decide on each one, until all steps are made or the recording ends."""

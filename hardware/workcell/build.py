@@ -33,8 +33,7 @@ from hardware.safety.decide import Action, Sensed, decide, load_limits
 from hardware.safety.eyes import NEAR_MM, ArmWatch, FreshFrames
 from hardware.safety.safe_arm import RETREAT_SHARES, NoWayBackError, SafeArm, try_each
 from hardware.workcell.ros2 import publishing
-from scenes import ObjectSpec, SensorSpec, ServoSpec
-from scenes.experiment import ExperimentSpec
+from scenes import ExperimentSpec, ObjectSpec, SensorSpec, ServoSpec
 from scenes.plugins import offered, others
 from twin.errors import ErrorsAs, FrameError, RenderError, format_count
 from twin.estimate import Estimate, SensorModel

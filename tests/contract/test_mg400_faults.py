@@ -12,8 +12,7 @@ from tried_faults import tried_in
 
 from hardware.arms import motion
 from hardware.arms.mg400 import Mg400Ports
-from hardware.arms.mg400_link import CommandPort, Feedback
-from hardware.arms.mg400_wire import PACKET, PACKET_BYTES, TEST_VALUE, newest_packet, take_reply
+from hardware.arms.mg400_wire import PACKET, PACKET_BYTES, TEST_VALUE, CommandPort, Feedback, newest_packet, take_reply
 from hardware.emulators.mg400 import FAULTS, Mg400Emulator, feedback_packet
 from hardware.emulators.mg400_controller import RefusedError
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError

@@ -12,9 +12,8 @@ from serial.tools import list_ports
 
 from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, KinematicArm
 from hardware.arms.awake import awake_s
-from hardware.arms.dobot_alarms import explain
 from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
-from hardware.arms.motion import MAGICIAN, LinkageKinematics
+from hardware.arms.motion import MAGICIAN, LinkageKinematics, explain
 from hardware.arms.supervisor import Supervisor
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 from twin.errors import ErrorsAs

@@ -11,9 +11,8 @@ import numpy as np
 from hardware.arms import mg400_wire as wire
 from hardware.arms import motion
 from hardware.arms.arm import POLL_S, ArmState, KinematicArm
-from hardware.arms.dobot_alarms import explain
 from hardware.arms.mg400_wire import REPLY_TIMEOUT_S, SILENCE_S, CommandPort, Feedback, NoReplyError
-from hardware.arms.motion import LinkageKinematics
+from hardware.arms.motion import LinkageKinematics, explain
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 
 LOG = logging.getLogger(__name__)

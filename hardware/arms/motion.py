@@ -1,4 +1,4 @@
-"""Kinematics of arms, checks of targets before anything is sent, and the motion of a simulated or emulated arm.
+"""Kinematics of arms, the Dobots' alarms, checks of targets before anything is sent, and the motion of a simulated or emulated arm.
 
 Poses are (6,): ``x, y, z, rx, ry, rz`` in mm and deg, static xyz Euler angles. Both Dobots carry their wrist on a parallel linkage: J2
 and J3 are absolute angles of the two links, J2 from the vertical and J3 downwards from the horizontal. So
@@ -19,15 +19,47 @@ from scipy.spatial.transform import Rotation, Slerp
 from hardware.errors import DeviceError
 from scenes.files import quote
 
-# Numbers of the Dobots' alarms that planning raises (see ``hardware.arms.dobot_alarms``).
+# Numbers of the alarms that planning raises.
 NO_INVERSE, TARGET_LIMIT, LINE_LEAVES_WORKSPACE = 17, 18, 23
-# Alarm of J1 above its range. The following numbers are J1 below, J2 above, ... up to 71.
+# That of J1 above its range. The following numbers are J1 below, J2 above, ... up to 71.
 FIRST_JOINT_ALARM = 64
 LINKAGE_ABOVE, LINKAGE_BELOW = 72, 73
 # Largest number that is believed in a pose or joint angle, mm or deg. No arm reaches ten metres, or turns a joint that far.
 FARTHEST = 1e4
 # Largest violation of a limit, deg, that is accepted, because the inverse kinematics has rounding errors.
 LIMIT_TOLERANCE_DEG = 1e-6
+_JOINT_ENDS = [f"J{joint} is {side} its range" for joint in (1, 2, 3, 4) for side in ("above", "below")]
+# Meanings and remedies of the alarms. The MG400 and the Magician use the same numbers.
+ALARMS = {
+    -2: "collision",
+    1: "a command was not understood",
+    16: "the target is at a singularity",
+    NO_INVERSE: "no joint angles reach the target",
+    TARGET_LIMIT: "the target is beyond a joint's range",
+    20: "the places of an arc lie on one line",
+    LINE_LEAVES_WORKSPACE: "the line to the target leaves the workspace",
+    **dict(enumerate(_JOINT_ENDS, start=FIRST_JOINT_ALARM)),
+    LINKAGE_ABOVE: "the parallelogram is at its end (J3 - J2 too large)",
+    LINKAGE_BELOW: "the parallelogram is at its end (J3 - J2 too small)",
+    **{79 + joint: f"J{joint} lost steps" for joint in (1, 2, 3, 4)},
+    85: "the emergency stop is or was pressed",
+    112: "collision",
+}
+_REMEDIES = {
+    **dict.fromkeys(range(80, 84), "free the arm and home it"),
+    -2: "free the arm by hand",
+    85: "release the emergency stop",
+    112: "free the arm by hand",
+}
+
+
+def explain(alarms: list[int]) -> str:
+    """One line on the given alarms, with the remedy."""
+    if not alarms:
+        return "alarm (the arm does not report which); call clear_error(), then enable()"
+    said = "; ".join(dict.fromkeys(f"alarm {alarm}: {ALARMS.get(alarm, 'see the vendor manual')}" for alarm in alarms))
+    first = next((_REMEDIES[alarm] for alarm in alarms if alarm in _REMEDIES), "move away from the limit")
+    return f"{said}; {first}, then call clear_error() and enable()"
 
 
 @dataclass(frozen=True)

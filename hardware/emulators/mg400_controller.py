@@ -15,7 +15,7 @@ from twin.errors import ErrorsAs
 
 # Largest accelerations. They are chosen for the emulator, because those of a real arm are not known.
 MAX_LINEAR_MM_S2, MAX_JOINT_DEG_S2 = 4000.0, 3000.0
-# Numbers of alarms (see ``hardware.arms.dobot_alarms``).
+# Numbers of alarms (see ``hardware.arms.motion``).
 EMERGENCY_STOP, COLLISIONS = 85, (112, -2)
 # Joints at the start, far from all limits.
 START_JOINTS_DEG = (0.0, 20.0, 40.0, 0.0)

@@ -96,15 +96,15 @@ class MG400(KinematicArm):
         self._motion = CommandPort(self.name, host, ports.motion)
         self._feedback = Feedback(self.name, host, ports.feedback, lenient=lenient)
         self._lenient = lenient
-        self._in_use = False  # true from connect to disconnect, even if the connection is lost in between
+        # whether it is in use: from connect to disconnect, even if the connection is lost in between; whether this driver has enabled it
+        # and not disabled it since; whether a move was sent whose end feedback has not shown yet; and whether late replies to moves may
+        # arrive for which no call waits any more
+        self._in_use = self._enabled = self._under_way = self._late_replies = False
         self._bare = False  # whether moves have no reply: old firmware, which only echoes on the dashboard, and some emulators
         self._alarm_text: str | None = None
         self._speed: tuple[float, float] | None = None  # mm/s and deg/s; None after speeds were set in percent
         self._sent: np.ndarray | None = None  # end of the queue while the arm may still move there
-        self._enabled = False  # whether this driver has enabled the arm and not disabled it since
-        self._under_way = False  # whether a move was sent whose end feedback has not shown yet
         self._mute_s = -np.inf  # time of the newest failed stop, emergency stop or disable
-        self._late_replies = False  # whether late replies to moves may arrive for which no call waits any more
 
     @property
     def is_connected(self) -> bool:

@@ -47,16 +47,13 @@ class SyncRobot(Closing):
     """
 
     EULER_AXES = EULER_AXES
+    info = _of_controller("info")
     elbow = target_elbow = None
 
     def __init__(self, controller: RobotController) -> None:
         self.controller = controller
         self._axes = "sxyz"
         self._T_base_work = self._T_tip_flange = np.eye(4)
-
-    @property
-    def info(self) -> str:
-        return self.controller.info
 
     @property
     def axes(self) -> str:
@@ -97,7 +94,8 @@ class SyncRobot(Closing):
 
     linear_speed, angular_speed = _of_controller("linear_speed"), _of_controller("angular_speed")
     speed, blend_radius = _of_controller("speed"), _of_controller("blend_radius")
-    joint_angles = _of_controller("joint_angles")  # present joints (J,), deg
+    # joints (J,), deg: the present ones, and those that were commanded last (None before the first move)
+    joint_angles, target_joint_angles = _of_controller("joint_angles"), _of_controller("commanded_joint_angles")
 
     @property
     def pose(self) -> np.ndarray:
@@ -108,11 +106,6 @@ class SyncRobot(Closing):
         """The last requested pose; None before the first one."""
         commanded = self.controller.commanded_pose
         return None if commanded is None else self._from_controller(commanded)
-
-    @property
-    def target_joint_angles(self) -> np.ndarray | None:
-        """Joints that were commanded last (J,), deg; None before the first move."""
-        return self.controller.commanded_joint_angles
 
     def move_joints(self, joint_angles: Numbers) -> None:
         if not FEWEST_JOINTS <= len(joint_angles) <= MOST_JOINTS:

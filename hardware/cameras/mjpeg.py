@@ -344,6 +344,8 @@ class JpegServer(ThreadingHTTPServer):
     host : str
     port : int
         Port; 0 for a free one, see ``url``.
+    refuses : callable, optional
+        Whether no client is served at present.
 
     Attributes
     ----------
@@ -357,10 +359,10 @@ class JpegServer(ThreadingHTTPServer):
 
     page, line = "", ""
 
-    def __init__(self, who: str, host: str, port: int) -> None:
+    def __init__(self, who: str, host: str, port: int, refuses: Callable[[], bool] = lambda: False) -> None:
         with ErrorsAs(OSError, lambda error: cannot_listen(who, host, port, error)):
             super().__init__((host, port), _Handler)
-        self.url = f"http://{host}:{self.server_port}/"
+        self.url, self.refuses = f"http://{host}:{self.server_port}/", refuses
         self._new, self.newest, self.ended = threading.Condition(), StreamPart(0, b""), threading.Event()
         self._thread = threading.Thread(target=self.serve_forever, name=who, daemon=True)
 
@@ -389,10 +391,6 @@ class JpegServer(ThreadingHTTPServer):
             part = self.newest
         self.ended.wait(max(0.0, part.due_s - time.monotonic()))
         return part
-
-    def refuses(self) -> bool:
-        """Whether no client is served at present."""
-        return False
 
 
 class PicturePage(JpegServer):

@@ -319,7 +319,7 @@ class _Stops:
         """The first frame exposed after a state."""
         remedy = "check the camera, then repeat the command to continue"
         with ErrorsAs(TimeoutError, lambda error: DeviceError(f"the arm stands still, but {error}; {remedy}")):
-            return self.mover.frame_after(state.time_s, timeout_s=self.frame_timeout_s)
+            return self.mover.watch.frame_after(self.mover.source, state.time_s, timeout_s=self.frame_timeout_s)
 
 
 @dataclass(frozen=True, kw_only=True)

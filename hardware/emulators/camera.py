@@ -35,20 +35,6 @@ FAULTS = {
 }
 
 
-class _Server(JpegServer):
-    """The camera's server, and the fault that cuts its connections."""
-
-    def __init__(self, faults: Faults, host: str, port: int) -> None:
-        super().__init__("camera emulator", host, port)
-        self._faults, self._pulled_s = faults, 0.0
-
-    def refuses(self) -> bool:
-        """See ``JpegServer``: the camera is unplugged by a fault at present."""
-        span_s = self._faults.value("unplugged")
-        self._pulled_s = 0.0 if span_s is None else self._pulled_s or time.monotonic()
-        return span_s is not None and time.monotonic() - self._pulled_s < span_s
-
-
 class CameraEmulator(Emulator):
     """Serves a source's frames as a stream. A context manager, which listens between ``start`` and ``stop``.
 
@@ -71,8 +57,8 @@ class CameraEmulator(Emulator):
     def __init__(self, source: FrameSource, *, host: str = "127.0.0.1", port: int = 0, faults: tuple[str, ...] = ()) -> None:
         self.faults = Faults(FAULTS, faults)
         self._source, self._address = source, (host, port)
-        self._running: tuple[_Server, threading.Thread] | None = None
-        self.made = 0
+        self._running: tuple[JpegServer, threading.Thread] | None = None
+        self.made, self._pulled_s = 0, 0.0
 
     @property
     def url(self) -> str:
@@ -82,7 +68,7 @@ class CameraEmulator(Emulator):
         return f"{self._running[0].url}{STREAM[1:]}"
 
     def start(self) -> None:
-        server = _Server(self.faults, *self._address)
+        server = JpegServer("camera emulator", *self._address, self._is_unplugged)
         self._source.connect()
         try:
             await_frame(self._source)  # the first frame compiles kernels, so it is made before a client can connect
@@ -101,7 +87,13 @@ class CameraEmulator(Emulator):
             self._running[1].join(timeout=15.0)
         self._source.disconnect()
 
-    def _make(self, server: _Server) -> None:
+    def _is_unplugged(self) -> bool:
+        """Whether the fault that cuts the connections does so at present."""
+        span_s = self.faults.value("unplugged")
+        self._pulled_s = 0.0 if span_s is None else self._pulled_s or time.monotonic()
+        return span_s is not None and time.monotonic() - self._pulled_s < span_s
+
+    def _make(self, server: JpegServer) -> None:
         last: np.ndarray | None = None
         while not server.ended.is_set():
             try:

@@ -489,7 +489,7 @@ class ServoLoop:
 
     def _exposed_after(self, time_s: float) -> Frame:
         """The first frame exposed after a time; raises ``TimeoutError`` if none comes. The wait also ends if the arm is lost."""
-        return self.mover.frame_after(time_s, timeout_s=self.settings.frame_timeout_s)
+        return self._watch.frame_after(self.source, time_s, timeout_s=self.settings.frame_timeout_s)
 
     def _reading(self, estimate: Estimate) -> tuple[Reading, str]:
         """Depth and angle of an estimate, and the reason why they can't be trusted ("" if they can)."""

@@ -425,10 +425,6 @@ class Mover:
         if self._safe is not None:
             self._safe.forget_contact()
 
-    def frame_after(self, time_s: float, *, timeout_s: float) -> Frame:
-        """The first frame exposed after a time; ``TimeoutError`` if none comes. The wait also ends if the arm is lost."""
-        return self.watch.frame_after(self.source, time_s, timeout_s=timeout_s)
-
     def go_around(self, clear: np.ndarray) -> ArmState:
         """Move around the object to a pose (6,) clear of it. Returns the state there."""
         for pose in path_around(self._placed, self.state().pose, clear):

@@ -45,6 +45,16 @@ def attached_ports() -> list[str]:
     return [port.device for port in list_ports.comports() if port.vid in USB_VENDORS]
 
 
+def attached_port() -> str:
+    """The port of the only attached adapter of a Magician's kind; ``DeviceError`` if there are none or several."""
+    found = attached_ports()
+    if len(found) != 1:
+        adapters = f"{len(found) or 'no'} serial adapters of a Magician's kind ({', '.join(USB_VENDORS.values())})"
+        there = ", ".join(found) or "plug in its USB cable"
+        raise DeviceError(f"{adapters} are attached: {there}; name one, for example magician:/dev/ttyUSB0")
+    return found[0]
+
+
 class Magician(KinematicArm):
     """A Dobot Magician.
 

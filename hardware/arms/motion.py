@@ -10,7 +10,6 @@ A motion is a sequence of moves, each with a trapezoidal or constant speed.
 
 from collections import deque
 from dataclasses import dataclass, replace
-from itertools import chain
 from threading import Lock
 
 import numpy as np
@@ -284,12 +283,12 @@ def between(kinematics: Kinematics, start: np.ndarray, end: np.ndarray, share: f
 def check_line(kinematics: Kinematics, start: np.ndarray, end: np.ndarray) -> Violation | None:
     """The first limit that a straight move would violate: its end is checked first, then its path."""
     steps = max(1, int(np.ceil(np.linalg.norm(end[:3] - start[:3]) / LINE_STEP_MM)))
-    for n in chain((steps,), range(1, steps)):  # a tuple of the steps to a place far away would fill the memory
+    for n in range(steps):  # the first one is the end
         try:
-            broken = kinematics.violation(kinematics.inverse(between(kinematics, start, end, n / steps, True)))
+            broken = kinematics.violation(kinematics.inverse(between(kinematics, start, end, n / steps if n else 1.0, True)))
         except OutOfReachError as error:
             broken = Violation(NO_INVERSE, str(error))
-        if broken and n < steps:
+        if broken and n:
             return Violation(LINE_LEAVES_WORKSPACE, f"the line to it leaves the workspace: {broken.text}")
         if broken:
             return broken if broken.code == NO_INVERSE else Violation(TARGET_LIMIT, broken.text)

@@ -27,8 +27,7 @@ from hardware.cameras.source import no_frame
 from hardware.errors import DeviceError, StaleDataError
 from hardware.rig.geometry import HOLD_DEG
 from hardware.safety.decide import DecisionCode, Sensed
-from hardware.safety.eyes import NEAR_MM as PIECES_MM
-from hardware.safety.eyes import BlindError, pieces_to
+from hardware.safety.eyes import NEAR_MM, BlindError, pieces_to
 from hardware.safety.safe_arm import RefusedMoveError
 from hardware.servo.timing import TimeSpread, Timing
 from hardware.workcell.build import MOVE_TIMEOUT_S, Mover, Rig
@@ -340,7 +339,7 @@ class ServoLoop:
 
     def _touch(self, target: np.ndarray) -> None:
         """Move straight to a pose (6,) in contact. Near the object each piece of the way follows a frame that shows its beginning."""
-        near_mm = max(self.servo.indent_mm, 0.0) + PIECES_MM if self.source.streams else 0.0
+        near_mm = max(self.servo.indent_mm, 0.0) + NEAR_MM if self.source.streams else 0.0
         for pose in pieces_to(self.mover.state().pose, self.mover.turned_for(target), near_mm):
             if near_mm:
                 with ErrorsAs(TimeoutError, lambda error: BlindError(f"{error}; {self.arm.name} moves only with fresh frames")):

@@ -118,15 +118,12 @@ def take_reply(buffer: str) -> tuple[Reply | None, str]:
 def why_refused(error_id: int, request: str) -> str:
     """The meaning of an error id, with the remedy."""
     if error_id == ErrorId.FAILED:
-        return (
-            f"the arm refused {request} (-1). If it refuses everything it is not in TCP mode: in DobotStudio Pro choose "
-            "TCP/IP Secondary Development; else it is disabled, in error, or the user or tool frame does not exist"
-        )
+        remedy = "If it refuses everything it is not in TCP mode: in DobotStudio Pro choose TCP/IP Secondary Development"
+        return f"the arm refused {request} (-1). {remedy}; else it is disabled, in error, or the user or tool frame does not exist"
     if error_id == ErrorId.NO_SUCH_COMMAND:
-        return (
-            f"the arm knows no {request} (-10000). If every command has this reply, the motion port 30003 is not open or another client "
-            "holds it: close other programs (DobotStudio Pro, scripts), then connect again; else its firmware is too old"
-        )
+        remedy = "close other programs (DobotStudio Pro, scripts), then connect again; else its firmware is too old"
+        held = "If every command has this reply, the motion port 30003 is not open or another client holds it"
+        return f"the arm knows no {request} (-10000). {held}: {remedy}"
     if error_id == ErrorId.PARAMETER_COUNT:
         return f"wrong number of parameters in {request} (-20000); its firmware may be of another version"
     kind, n = ("range", -error_id - 40000) if error_id < ErrorId.PARAMETER_RANGE else ("type", -error_id - 30000)
@@ -225,10 +222,9 @@ def why_no_packet(came: bytes, *, closed: bool) -> str:
     if not came and closed:
         return "it closed the connection at once: another program holds the arm (DobotStudio Pro, a script). Close it, then connect again"
     if not came:
-        return (
-            "connected, but nothing came: the controller hangs, another program holds the feedback, or this is no MG400 "
-            "(a server that waits for a request). Check the address, close other programs, else restart the arm"
-        )
+        other = "another program holds the feedback, or this is no MG400 (a server that waits for a request)"
+        remedy = "Check the address, close other programs, else restart the arm"
+        return f"connected, but nothing came: the controller hangs, {other}. {remedy}"
     packet, _ = newest_packet(came, lenient=True)
     if packet is not None:
         remedy = "an emulator, or a controller of another kind. If their poses can be trusted, use it as 'mg400-lenient:ADDRESS'"

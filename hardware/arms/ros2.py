@@ -105,11 +105,10 @@ class Ros2Arm(BaseArm):
         self._thread.start()
         if not happens(lambda: self._pose_s > 0 < self._joints_s and writer.heard, CONNECT_S):
             self._close()
-            raise DeviceNotConnectedError(
-                f"{self.name}: not found in domain {domain_id()}: it needs poses on {pose}, {self.axes} joints on {joints}, and a node "
-                f"that takes {self._kind} on {command}; start them, or name other topics ({ARM_FORM}); without an arm: "
-                f"'twin emulate ros2'. There are: {', '.join(participant.topics()) or 'no topics'}"
-            )
+            needs = f"poses on {pose}, {self.axes} joints on {joints}, and a node that takes {self._kind} on {command}"
+            remedy = f"start them, or name other topics ({ARM_FORM}); without an arm: 'twin emulate ros2'"
+            there = ", ".join(participant.topics()) or "no topics"
+            raise DeviceNotConnectedError(f"{self.name}: not found in domain {domain_id()}: it needs {needs}; {remedy}. There are: {there}")
         self._writer = writer
         LOG.warning("%s: the network guarantees nothing and no emergency stop is behind it; keep a hand at the arm's own", self.name)
 

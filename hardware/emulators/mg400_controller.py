@@ -140,17 +140,10 @@ class Mg400Controller:
     def mode(self) -> Mode:
         now_s = self.update()
         with self.lock:
-            if self.alarms:
-                return Mode.ERROR
-            if not self.enabled:
-                return Mode.DISABLED
-            if self.dragged:
-                return Mode.BACKDRIVE
-            if self.paused:
-                return Mode.PAUSE
-            if self.track.moving(now_s):
-                return Mode.JOG if self._orders[-1].jog else Mode.RUNNING
-            return Mode.ENABLED
+            moving = self.track.moving(now_s)
+            holds = {Mode.ERROR: self.alarms, Mode.DISABLED: not self.enabled, Mode.BACKDRIVE: self.dragged, Mode.PAUSE: self.paused}
+            holds |= {Mode.JOG: moving and self._orders[-1].jog, Mode.RUNNING: moving}
+            return next((mode for mode, held in holds.items() if held), Mode.ENABLED)
 
     def busy(self) -> bool:
         """Whether commands are still in progress or queued (``Sync`` waits for them)."""

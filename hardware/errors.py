@@ -8,7 +8,8 @@ import errno
 import re
 import socket
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Self
 
@@ -79,6 +80,16 @@ def leave(disconnect: Callable[[], None], error: BaseException | None) -> None:
         if error is None:
             raise
         error.add_note(str(failed))
+
+
+@contextmanager
+def on_error(release: Callable[[], None]) -> Iterator[None]:
+    """Context that releases what was opened after any error, Ctrl-C included. If that fails, it is added to the error as a note."""
+    try:
+        yield
+    except BaseException as error:
+        leave(release, error)
+        raise
 
 
 def also(error: BaseException, what: str) -> None:

@@ -15,7 +15,7 @@ from hardware.arms.awake import awake_s
 from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
 from hardware.arms.motion import MAGICIAN, LinkageKinematics, explain
 from hardware.arms.supervisor import Supervisor
-from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
+from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError, on_error
 from twin.errors import ErrorsAs
 
 # Longest wait for a reply, in s. A reply usually takes about 10 ms. All tries together take as long as feedback may be old.
@@ -98,12 +98,9 @@ class Magician(KinematicArm):
             remedy = "on Linux the user must be in the group 'dialout'; and no other program may hold the port"
             emulated = "without an arm: 'twin emulate magician'"
             raise DeviceNotConnectedError(f"{self.name}: can't open the port ({error}); {there}; {remedy}; {emulated}") from error
-        try:
+        with on_error(self._close):
             self._buffer = b""
             self._request(Id.GET_POSE)
-        except BaseException:
-            self._close()
-            raise
 
     def disconnect(self) -> None:
         if self.is_connected:

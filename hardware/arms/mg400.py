@@ -13,7 +13,7 @@ from hardware.arms import motion
 from hardware.arms.arm import POLL_S, ArmState, KinematicArm
 from hardware.arms.mg400_wire import REPLY_TIMEOUT_S, SILENCE_S, CommandPort, Feedback, NoReplyError
 from hardware.arms.motion import LinkageKinematics, explain
-from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
+from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError, on_error
 
 LOG = logging.getLogger(__name__)
 # Longest wait in s until feedback shows that the arm is enabled, or that an alarm is cleared.
@@ -113,15 +113,12 @@ class MG400(KinematicArm):
     def connect(self) -> None:
         self._require_disconnected()
         self._close()  # remains of a lost connection
-        try:
+        with on_error(self._close):
             self._dashboard.open()
             self._motion.open()
             self._feedback.open()
             self._bare = self._ask("GetErrorID()").error_id is None  # the query that emulators know, too
             self._in_use = True
-        except BaseException:
-            self._close()
-            raise
 
     def disconnect(self) -> None:
         if self._in_use and (self._enabled or self._under_way):

@@ -15,7 +15,7 @@ from hardware.cameras.mjpeg import STREAM, WAIT_S, JpegServer, StreamPart, jpeg_
 from hardware.cameras.source import FrameSource, await_frame
 from hardware.cameras.twin import TwinCamera
 from hardware.emulators.faults import EVERY_NTH, SECONDS, Emulator, Fault, Faults
-from hardware.errors import DeviceError
+from hardware.errors import DeviceError, on_error
 from hardware.rig.geometry import PlacedObject
 from hardware.workcell.build import draw_window
 from scenes import ObjectSpec, SensorSpec, ServoSpec, load_experiment
@@ -70,12 +70,8 @@ class CameraEmulator(Emulator):
     def start(self) -> None:
         server = JpegServer("camera emulator", *self._address, self._is_unplugged)
         self._source.connect()
-        try:
+        with on_error(self._source.disconnect), on_error(server.stop):
             await_frame(self._source)  # the first frame compiles kernels, so it is made before a client can connect
-        except BaseException:
-            server.stop()
-            self._source.disconnect()
-            raise
         self._running = server, threading.Thread(target=self._make, args=(server,), name="camera emulator", daemon=True)
         server.start()
         self._running[1].start()

@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from hardware.errors import DeviceError
+from hardware.errors import DeviceError, on_error
 from scenes.files import quote
 from twin.errors import ErrorsAs, TwinError
 from twin.signals import signals_as_ctrl_c
@@ -227,11 +227,8 @@ class PortServer(socketserver.ThreadingTCPServer):
         super().__init__(address, socketserver.BaseRequestHandler, bind_and_activate=False)
         self.clients: set[socket.socket] = set()
         self._serve, self._deaf = serve, deaf
-        try:
+        with on_error(self.server_close):
             self.server_bind()
-        except OSError:
-            self.server_close()
-            raise
         if not deaf:
             self.server_activate()
             Thread(target=self.serve_forever, args=(CLOSED_S,), daemon=True, name="emulated port").start()

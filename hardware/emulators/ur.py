@@ -13,7 +13,7 @@ import struct
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
 from threading import Event, Lock, Thread
 from typing import Any
 
@@ -22,7 +22,8 @@ import numpy as np
 from hardware.arms.motion import MotionTrack, Speeds, Violation
 from hardware.arms.ur import driver as ur
 from hardware.emulators.faults import SECONDS, SHARE, EmulatedArm, Fault, Faults, PortServer
-from hardware.errors import cannot_listen
+from hardware.errors import cannot_listen, on_error
+from twin.errors import ErrorsAs
 from twin.rig.arm_pose import matrix_of
 
 LOG = logging.getLogger(__name__)
@@ -268,11 +269,8 @@ class UrEmulator(EmulatedArm):
             A port is taken, or the host is not this machine's.
         """
         for port, serve in ((ur.DASHBOARD_PORT, self._serve_dashboard), (SCRIPT_PORT, self._serve_scripts), (RTDE_PORT, self._serve_rtde)):
-            try:
+            with on_error(self.unplug), ErrorsAs(OSError, partial(cannot_listen, "ur", self.host, port, option="`host`")):
                 self._ports.append(PortServer((self.host, port), serve))
-            except OSError as error:
-                self.unplug()
-                raise cannot_listen("ur", self.host, port, error, option="`host`") from error
 
     def unplug(self) -> None:
         """Lose every connection. The arm goes on."""

@@ -26,7 +26,7 @@ from hardware.arms.motion import turn_between_deg
 from hardware.arms.open_arm import kind_of, open_arm
 from hardware.cameras.source import FrameSource, await_frame, open_camera
 from hardware.cameras.twin import TwinCamera, preview_of
-from hardware.errors import DeviceError, leave
+from hardware.errors import DeviceError, leave, on_error
 from hardware.rig.geometry import HOLD_DEG, LastAxis, PlacedObject, path_around, shift_in_tool
 from hardware.safety.decide import Action, Sensed, decide, load_limits
 from hardware.safety.eyes import NEAR_MM, ArmWatch, FreshFrames
@@ -121,11 +121,8 @@ class Rig:
 
     def __enter__(self) -> "Rig":
         self.arm.connect()
-        try:
+        with on_error(self.arm.disconnect):
             self.source.connect()
-        except BaseException:
-            self.arm.disconnect()
-            raise
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object, /) -> None:

@@ -16,7 +16,7 @@ from hardware.arms.mg400 import MG400
 from hardware.arms.mg400_wire import DEFAULT_HOSTS, MAX_JOINT_DEG_S, MAX_LINEAR_MM_S
 from hardware.arms.motion import circle, way_between
 from hardware.arms.open_arm import open_arm
-from hardware.errors import DeviceError, leave, undo
+from hardware.errors import DeviceError, leave, on_error, undo
 
 # Speeds at the start, as in cri: % of the MG400's largest speed, mm/s and deg/s for other arms.
 START_SPEED = 20.0
@@ -94,13 +94,10 @@ class RobotController(Closing):
         self.commanded_pose: np.ndarray | None = None
         self.commanded_joint_angles: np.ndarray | None = None
         self.arm.connect()
-        try:
+        with on_error(self.arm.disconnect):
             self.arm.clear_error()
             self.arm.enable()
             self._set_speeds()
-        except BaseException as error:
-            leave(self.arm.disconnect, error)
-            raise
 
     @property
     def info(self) -> str:

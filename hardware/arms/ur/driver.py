@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, KinematicArm, happens
 from hardware.arms.motion import LIMIT_TOLERANCE_DEG, TARGET_LIMIT, OutOfReachError, StageKinematics, Violation, way_between
 from hardware.arms.ur.client import CONNECT_S, WATCHDOG_HZ, ClientProcess
-from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
+from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError, on_error
 from twin.errors import ErrorsAs, ExtraError
 from twin.rig.arm_pose import matrix_of
 
@@ -185,7 +185,7 @@ class UR(KinematicArm):
         remedy = "check the address, the cable, and that RTDE and dashboard are switched on, or start 'twin emulate ur'"
         with ErrorsAs(ConnectionError, lambda error: DeviceNotConnectedError(f"{self.name}: can't connect ({error}); {remedy}")):
             self._client = ClientProcess(self._host)
-        try:
+        with on_error(self._close):
             self._require_shown(lambda packet: True, REPLY_S, "sends no feedback")
             version = re.search(r"\d+", self._tell("PolyscopeVersion", REPLY_S))
             model = self._tell("get robot model", REPLY_S).rstrip("e"), int(version[0] if version else 0)
@@ -194,9 +194,6 @@ class UR(KinematicArm):
             state, kinematics = self.state(), self.kinematics
             kinematics.lengths_mm[:] = MODELS[model]
             kinematics.T_flange_tool[:] = np.linalg.inv(kinematics.flange(state.joints_deg)) @ matrix_of(state.pose)
-        except BaseException:
-            self._close()
-            raise
 
     def disconnect(self) -> None:
         if self._enabled:

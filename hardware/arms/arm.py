@@ -234,9 +234,13 @@ class BaseArm(Connection):
         if failed is not None and not told:
             raise failed
 
-    def _too_long(self, timeout_s: float) -> DeviceError:
-        remedy = "allow more time or more speed, or look for an obstacle"
-        return DeviceError(f"{self.name}: the move did not end within {timeout_s:g} s and was stopped; {remedy}")
+    def _require_on_way(self, state: ArmState, deadline: float, timeout_s: float) -> None:
+        """Raise ``DeviceError`` if a state reports an error, or if the move has lasted too long."""
+        if state.error:
+            raise DeviceError(f"{self.name}: stopped on the way: {state.error}")
+        if time.monotonic() > deadline:
+            remedy = "allow more time or more speed, or look for an obstacle"
+            raise DeviceError(f"{self.name}: the move did not end within {timeout_s:g} s and was stopped; {remedy}")
 
     def _require_speeds(self, linear_mm_s: float, angular_deg_s: float) -> None:
         self._require_connected()

@@ -315,13 +315,10 @@ class MG400(KinematicArm):
                 self._late_replies = False
                 return
             state = self.state()
-            if state.error:
-                raise DeviceError(f"{self.name}: stopped on the way: {state.error}")
+            self._require_on_way(state, deadline, timeout_s)
             rest_since = None if state.moving or state.time_s < asked_s else rest_since or state.time_s
             if not syncs and rest_since is not None and state.time_s - rest_since > RESTED_S:
                 return
-            if time.monotonic() > deadline:
-                raise self._too_long(timeout_s)
             if not syncs:
                 time.sleep(POLL_S)
 

@@ -165,14 +165,13 @@ def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str 
     low, high = np.array(list(experiment.ranges().values())).T
     if design == "random":
         numbers = np.random.default_rng([seed, index]).uniform(low, high)
-        return PlannedContact(numbers[:6], numbers[6:])
-    from scipy.stats.qmc import Sobol
+    else:
+        from scipy.stats.qmc import Sobol
 
-    varied = high > low
-    sequence = Sobol(int(varied.sum()), scramble=True, rng=np.random.default_rng(seed))
-    shares = sequence.fast_forward(index).random(1)[0] if index else sequence.random(1)[0]
-    numbers = low.copy()
-    numbers[varied] += shares * (high - low)[varied]
+        numbers, varied = low.copy(), high > low
+        sequence = Sobol(int(varied.sum()), scramble=True, rng=np.random.default_rng(seed))
+        shares = sequence.fast_forward(index).random(1)[0] if index else sequence.random(1)[0]
+        numbers[varied] += shares * (high - low)[varied]
     return PlannedContact(numbers[:6], numbers[6:])
 
 

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from threading import Event, Lock, Thread
 
-from hardware.arms.magician_wire import Message, take_message
+from hardware.arms.magician import Message, take_message
 from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, EmulatedArm, Fault, Range
 from hardware.emulators.magician_controller import EmulatedController
 from twin.errors import ErrorsAs, TwinError

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hardware.arms.magician_wire import Id, Message, Ptp
+from hardware.arms.magician import Id, Message, Ptp
 from hardware.arms.motion import MAGICIAN, NO_INVERSE, MotionTrack, OutOfReachError, Speeds, Violation, check_line, circle
 from hardware.emulators.faults import Faults
 

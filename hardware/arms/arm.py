@@ -12,7 +12,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Protocol, Self
 
@@ -150,6 +150,7 @@ class BaseArm(Connection):
 
     axes: int
     _unstopped = False  # whether the newest stop failed and this was reported
+    _speeds = motion.Speeds(50.0, 30.0)  # until ``set_speed``
 
     @abstractmethod
     def stop(self) -> None: ...
@@ -242,10 +243,12 @@ class BaseArm(Connection):
             remedy = "allow more time or more speed, or look for an obstacle"
             raise DeviceError(f"{self.name}: the move did not end within {timeout_s:g} s and was stopped; {remedy}")
 
-    def _require_speeds(self, linear_mm_s: float, angular_deg_s: float) -> None:
+    def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
+        """Keep the speeds of the moves that follow; see ``Arm``."""
         self._require_connected()
         if not (0 < linear_mm_s < np.inf and 0 < angular_deg_s < np.inf):
             raise DeviceError(f"{self.name}: speeds of {linear_mm_s} mm/s and {angular_deg_s} deg/s; both must be positive")
+        self._speeds = replace(self._speeds, linear_mm_s=linear_mm_s, angular_deg_s=angular_deg_s)
 
 
 class KinematicArm(BaseArm):
@@ -334,10 +337,6 @@ class SimulatedArm(KinematicArm):
 
     def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState:
         return self._state_at(time.monotonic())
-
-    def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
-        self._require_speeds(linear_mm_s, angular_deg_s)
-        self._speeds = motion.Speeds(linear_mm_s, angular_deg_s, self._speeds.linear_mm_s2, self._speeds.angular_deg_s2)
 
     def _state_at(self, time_s: float) -> ArmState:
         self._require_connected()

@@ -285,7 +285,7 @@ class Magician(KinematicArm):
         return ArmState(pose, values[4:], begun_s, self._enabled, moving, explain(alarms) if alarms else "")
 
     def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
-        self._require_speeds(linear_mm_s, angular_deg_s)
+        super().set_speed(linear_mm_s, angular_deg_s)
         line = (linear_mm_s, angular_deg_s, ACCELERATION * linear_mm_s, ACCELERATION * angular_deg_s)
         joints = [angular_deg_s] * 4 + [ACCELERATION * angular_deg_s] * 4
         self._request(Id.PTP_COORDINATE_PARAMS, struct.pack("<4f", *line), ctrl=WRITE)

@@ -218,7 +218,7 @@ class MG400(KinematicArm):
 
         In a linear move the turn may also reach the given angular speed, even if the move is short.
         """
-        self._require_speeds(linear_mm_s, angular_deg_s)
+        super().set_speed(linear_mm_s, angular_deg_s)
         self.set_speed_percent(linear=100 * linear_mm_s / wire.MAX_LINEAR_MM_S, angular=100 * angular_deg_s / wire.MAX_JOINT_DEG_S)
         self._speed = linear_mm_s, angular_deg_s
 

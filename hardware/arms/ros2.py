@@ -11,13 +11,14 @@ import contextlib
 import logging
 import re
 import time
+from dataclasses import replace
 from threading import Event, Lock, Thread
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, BaseArm, happens
-from hardware.arms.motion import MotionTrack, Speeds, StageKinematics, finite_numbers
+from hardware.arms.motion import MotionTrack, StageKinematics, finite_numbers
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 from hardware.ros2.dds import Participant, Reader, Writer, domain_id
 from scenes.files import quote
@@ -80,7 +81,6 @@ class Ros2Arm(BaseArm):
         self._writer: Writer | None = None
         self._enabled = self._going = False
         self._fault, self._frame = "", ""
-        self._speed = np.array([50.0, 30.0])  # mm/s, deg/s
         self._forget()
 
     def _forget(self) -> None:
@@ -173,9 +173,9 @@ class Ros2Arm(BaseArm):
             moving = self._going or self._pose_s - self._rest_s < REST_S
             return ArmState(self._pose, self._joints, self._pose_s, self._enabled, moving, self._fault)
 
-    def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
-        self._require_speeds(linear_mm_s, angular_deg_s)
-        self._speed = np.array([linear_mm_s, angular_deg_s])
+    @property
+    def _speed(self) -> np.ndarray:
+        return np.array([self._speeds.linear_mm_s, self._speeds.angular_deg_s])
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         with self._watch_move():
@@ -186,7 +186,7 @@ class Ros2Arm(BaseArm):
                     raise DeviceError(f"{self.name}: {self._fault or 'not enabled'}; call clear_error() and enable()")
                 if not self._going:
                     self._hold()
-                speeds = Speeds(*self._speed, ACCELERATION, ACCELERATION)
+                speeds = replace(self._speeds, linear_mm_s2=ACCELERATION, angular_deg_s2=ACCELERATION)
                 self._track.move(sent, speeds, linear=True, now_s=time.monotonic())
                 self._going = True
             if wait:

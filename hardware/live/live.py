@@ -443,7 +443,7 @@ def watch(
             about = {"sensor": model.sensor.name, "form": str(source.form), "camera": source.name, "model": name}
             stack.enter_context(output(plan.record, *SESSION_FILES))
             stack.enter_context(kept)
-            stack.callback(lambda: session.count and kept.catch_up())  # however it ended
+            stack.callback(_catch_up, session, kept)
             session.record = stack.enter_context(SessionWriter(plan.record, about))
             if rest is not None:
                 session.record.keep_rest(rest)
@@ -454,6 +454,12 @@ def watch(
             interrupted = True
         same = (same_estimates(source.session.steps, found), len(found)) if isinstance(source, SessionSource) else None
         return WatchResult(session.timing(), interrupted, same, plan.record, session.count, source.notes(), session.valid, session.invalid)
+
+
+def _catch_up(session: LiveSession, kept: KeptAlso) -> None:
+    """Write a session with at least one step in the further formats, however it ended."""
+    if session.count:
+        kept.catch_up()
 
 
 def _at_rest(plan: WatchPlan, model: SensorModel, source: FrameSource, rest: Frame | None) -> tuple[SensorModel, Frame | None]:

@@ -146,8 +146,8 @@ POWER_S, UNLOCK_S, REPLY_S, STOP_S, READ_S = 30.0, 8.0, 1.0, 0.4, 0.05
 # Speeds of joints, rad/s, above which the arm moves: the target's, which has no noise, and the measured one.
 TARGET_RAD_S, ACTUAL_RAD_S = 1e-5, 0.02
 HALF_TURN_DEG = 181.0  # the most that a joint turns in a linear move, and a margin
-# Speeds until ``set_speed``, mm/s and deg/s; the largest speed, m/s or rad/s; accelerations of lines, m/s^2, and of joints, rad/s^2.
-SPEEDS, MOST_SPEED, LINEAR_M_S2, JOINT_RAD_S2 = (50.0, 30.0), 3.0, 1.2, 1.4
+# The largest speed, m/s or rad/s; accelerations of lines, m/s^2, and of joints, rad/s^2.
+MOST_SPEED, LINEAR_M_S2, JOINT_RAD_S2 = 3.0, 1.2, 1.4
 
 
 class UR(KinematicArm):
@@ -170,7 +170,7 @@ class UR(KinematicArm):
         self.name, self._host = f"UR at {host}", host
         self.kinematics = UrKinematics()
         self._client: Any = None  # a ``ClientProcess`` from connect to disconnect, even if the connection is lost in between
-        self._speeds, self._slider = SPEEDS, 1.0
+        self._slider = 1.0
         self._enabled = self._under_way = False  # whether this driver has enabled it, and has sent a move since it stood
 
     @property
@@ -257,10 +257,6 @@ class UR(KinematicArm):
         error = SAFETY.get(packet["SafetyMode"], ended)
         return ArmState(pose, joints, packet["time_s"], self._enabled and not error, _moves(packet), error)
 
-    def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
-        self._require_speeds(linear_mm_s, angular_deg_s)
-        self._speeds = linear_mm_s, angular_deg_s
-
     def _joints_at(self, pose: np.ndarray) -> np.ndarray:
         self.state()  # which tells the kinematics the present joints
         return super()._joints_at(pose)
@@ -271,13 +267,13 @@ class UR(KinematicArm):
             raise DeviceError(f"{self.name}: {state.error or 'not enabled; call enable() first'}")
         self._require_within(joints)
         if pose is None:
-            method, target, speed, acceleration = "moveJ", np.radians(joints).tolist(), np.radians(self._speeds[1]), JOINT_RAD_S2
+            method, target, speed, acceleration = "moveJ", np.radians(joints).tolist(), np.radians(self._speeds.angular_deg_s), JOINT_RAD_S2
         else:
             if np.abs(joints - state.joints_deg).max() > HALF_TURN_DEG:  # ``inverse`` has turned it back by a full turn
                 raise DeviceError(f"{self.name}: a joint would pass its end, so nothing was sent; turn it back with move_joints")
             # the arm takes the speed as m/s or as rad/s: whichever takes longer, line or turn
             way_mm, turn_deg = way_between(state.pose, pose, self.axes)
-            lasts_s = max(way_mm / self._speeds[0], turn_deg / self._speeds[1], POLL_S)
+            lasts_s = max(way_mm / self._speeds.linear_mm_s, turn_deg / self._speeds.angular_deg_s, POLL_S)
             method, target, speed, acceleration = "moveL", pose_to_ur(pose), max(way_mm / 1000, np.radians(turn_deg)) / lasts_s, LINEAR_M_S2
         if (slider := self._newest()["TargetSpeedFraction"]) != self._slider:
             LOG.warning("%s: its speed slider is at %.0f %%, which slows all moves", self.name, 100 * slider)

@@ -82,16 +82,6 @@ def leave(disconnect: Callable[[], None], error: BaseException | None) -> None:
         error.add_note(str(failed))
 
 
-@contextmanager
-def on_error(release: Callable[[], None]) -> Iterator[None]:
-    """Context that releases what was opened after any error, Ctrl-C included. If that fails, it is added to the error as a note."""
-    try:
-        yield
-    except BaseException as error:
-        leave(release, error)
-        raise
-
-
 def also(error: BaseException, what: str) -> None:
     """Add to an error what failed after it: at the end of the message of a ``DeviceError``, or as a note to any other error."""
     if isinstance(error, DeviceError) and error.args:
@@ -106,6 +96,16 @@ def undo(act: Callable[[], object], error: BaseException) -> None:
         act()
     except DeviceError as failed:
         also(error, str(failed))
+
+
+@contextmanager
+def on_error(act: Callable[[], object]) -> Iterator[None]:
+    """Context that stops, releases or switches off something after any error, Ctrl-C included. If that fails, it is added to the error."""
+    try:
+        yield
+    except BaseException as error:
+        undo(act, error)
+        raise
 
 
 # Longest line about an arm or a camera, in characters. Longer messages, and notes, go to a file.

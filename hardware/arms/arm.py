@@ -205,15 +205,6 @@ class BaseArm(Connection):
                 undo(self.stop, error)
             raise
 
-    @contextmanager
-    def _watch_enabling(self) -> Iterator[None]:
-        """Context in which the arm is enabled. After any error, Ctrl-C included, it is disabled, because it may have obeyed."""
-        try:
-            yield
-        except BaseException as error:
-            undo(self.disable, error)
-            raise
-
     def _require_possible(self, pose: np.ndarray) -> None:
         """Raise ``StaleDataError`` if a reported pose (6,) is impossible, because the arm's real pose is then unknown."""
         if not (np.abs(pose) < motion.FARTHEST).all():  # also true for NaN

@@ -135,7 +135,7 @@ class MG400(KinematicArm):
             LOG.warning("%s: %s", self.name, shared)
         if self._supervised and not self._enabled:
             self._dashboard.supervise(*LAST_WORDS)
-        with self._watch_enabling():
+        with on_error(self.disable):  # it may have obeyed
             self._enabled = True  # from now on it may be, even if nothing is heard of it
             for request in ("EnableRobot()", "User(0)", "Tool(0)"):
                 self._ask(request)

@@ -11,14 +11,13 @@ import contextlib
 import logging
 import re
 import time
-from dataclasses import replace
 from threading import Event, Lock, Thread
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, BaseArm, happens
-from hardware.arms.motion import MotionTrack, StageKinematics, finite_numbers
+from hardware.arms.motion import MotionTrack, Speeds, StageKinematics, finite_numbers
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 from hardware.ros2.dds import Participant, Reader, Writer, domain_id
 from scenes.files import quote
@@ -70,6 +69,8 @@ class Ros2Arm(BaseArm):
     pose, joints, command : str
         Topics; an empty one is the usual one of the form.
     """
+
+    _speeds = Speeds(50.0, 30.0, ACCELERATION, ACCELERATION)
 
     def __init__(
         self, form: str, *, axes: int = 6, namespace: str = "", pose: str = "current_pose", joints: str = "joint_states", command: str = ""
@@ -186,8 +187,7 @@ class Ros2Arm(BaseArm):
                     raise DeviceError(f"{self.name}: {self._fault or 'not enabled'}; call clear_error() and enable()")
                 if not self._going:
                     self._hold()
-                speeds = replace(self._speeds, linear_mm_s2=ACCELERATION, angular_deg_s2=ACCELERATION)
-                self._track.move(sent, speeds, linear=True, now_s=time.monotonic())
+                self._track.move(sent, self._speeds, linear=True, now_s=time.monotonic())
                 self._going = True
             if wait:
                 self._wait_until_settled(sent, timeout_s=timeout_s)

@@ -23,7 +23,7 @@ import numpy as np
 
 from hardware.cameras import reader
 from hardware.cameras.reader import DevicePicture, LiveSource, ReadFailed, TornPicture
-from hardware.errors import DeviceError, cannot_listen
+from hardware.errors import DeviceError, cannot_listen, on_error
 from scenes.files import quote
 from scenes.sensor import SensorSpec
 from twin.errors import ErrorsAs, FrameError
@@ -291,11 +291,8 @@ class MjpegCamera(LiveSource):
             data = answer.read()
             self._close()
             if data != self._before:
-                try:
+                with on_error(lambda: self._end.wait(reader.FAILED_PAUSE_S)):  # it may be about to be replaced
                     image, note = decode_picture(data)
-                except TornPicture:
-                    self._end.wait(reader.FAILED_PAUSE_S)  # it may be about to be replaced
-                    raise
                 self._before = data
                 return DevicePicture(image, begun_s, 0, note)
             if time.monotonic() > until_s:

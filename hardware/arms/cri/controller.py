@@ -16,7 +16,7 @@ from hardware.arms.mg400 import MG400
 from hardware.arms.mg400_wire import DEFAULT_HOSTS, MAX_JOINT_DEG_S, MAX_LINEAR_MM_S
 from hardware.arms.motion import circle, way_between
 from hardware.arms.open_arm import open_arm
-from hardware.errors import DeviceError, leave, on_error, undo
+from hardware.errors import DeviceError, leave, on_error
 
 # Speeds at the start, as in cri: % of the MG400's largest speed, mm/s and deg/s for other arms.
 START_SPEED = 20.0
@@ -208,13 +208,9 @@ class RobotController(Closing):
         if self._newest is None:
             self._newest = NewestTarget(self.arm, *self._speeds())
             self._newest.start()
-        try:
+        with on_error(self.arm.stop), on_error(self._end_servo):
             self._newest.go(flange)
             time.sleep(delay_s)
-        except BaseException as error:
-            self._end_servo()
-            undo(self.arm.stop, error)
-            raise
 
     def _end_servo(self) -> None:
         if self._newest is not None:

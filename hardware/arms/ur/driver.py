@@ -213,7 +213,7 @@ class UR(KinematicArm):
                 self._require_shown(lambda packet, mode=mode: packet["RobotMode"] >= mode, POWER_S, otherwise)  # type: ignore[misc]
         self._ask("connect", timeout_s=CONNECT_S)
         if not self._enabled or packet["RuntimeState"] != PLAYING:
-            with self._watch_enabling():
+            with on_error(self.disable):  # it may have obeyed
                 self._enabled = True  # from now on the program may run, even if nothing is heard of it
                 self._ask("enable", timeout_s=CONNECT_S)
                 self._require_shown(lambda packet: packet["RuntimeState"] == PLAYING, REPLY_S, ENDED)

@@ -144,11 +144,10 @@ _MAGICIAN_LIMITS_DEG = ((-125.0, 125.0), (-5.0, 90.0), (-15.0, 70.0), (-150.0, 1
 MAGICIAN = LinkageKinematics(135.0, 147.0, 0.0, 0.0, _MAGICIAN_LIMITS_DEG)
 
 
-@dataclass(frozen=True)
 class StageKinematics:
     """An ideal stage of six axes: its "joints" are the pose, three in mm and three in deg."""
 
-    axes: int = 6
+    axes = 6
 
     def forward(self, joints_deg: np.ndarray) -> np.ndarray:
         return np.array(joints_deg, float)

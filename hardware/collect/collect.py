@@ -107,10 +107,8 @@ class Collection:
         self.pictures.mkdir(exist_ok=True)
         for lines in (table, self.folder / LOG):
             if lines.is_file():
-                try:
+                with _damaged(lines):
                     text = lines.read_text(encoding="utf-8")
-                except ValueError as error:
-                    raise DeviceError(f"{lines}: is damaged ({quote(error)}); give another `out`") from error
                 if not text.endswith("\n"):  # the last line is torn
                     write_text(lines, text[: text.rfind("\n") + 1])
         if not table.is_file() or not table.read_text(encoding="utf-8"):
@@ -126,8 +124,7 @@ class Collection:
             The table is damaged.
         """
         table = self.folder / TABLE
-        damaged = ErrorsAs((ValueError, csv.Error), lambda error: DeviceError(f"{table}: is damaged ({quote(error)}); give another `out`"))
-        with damaged, table.open(newline="", encoding="utf-8") as file:
+        with _damaged(table), table.open(newline="", encoding="utf-8") as file:
             rows = list(csv.reader(file))
         if rows[:1] != [list(COLUMNS)] or any(len(row) != len(COLUMNS) for row in rows):
             raise DeviceError(f"{table}: is not the table of a collection; give another `out`")
@@ -153,6 +150,11 @@ class Collection:
             csv.writer(file, lineterminator="\n").writerow(row)
             file.flush()
             os.fsync(file.fileno())
+
+
+def _damaged(file: Path) -> ErrorsAs[Exception]:
+    """Context of reading a file of a collection, whose errors become a ``DeviceError``."""
+    return ErrorsAs((ValueError, csv.Error), lambda error: DeviceError(f"{file}: is damaged ({quote(error)}); give another `out`"))
 
 
 def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str = "random") -> PlannedContact:

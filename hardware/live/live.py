@@ -9,7 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from socket import create_connection
@@ -83,8 +83,9 @@ class RerunView:
         DeviceError
             No viewer answers at the address, or the file can't be written.
         """
-        stream = self._stream
-        try:
+        stream, told = self._stream, f"`rerun` {self._target}: can't be opened"
+        remedy = f"start a viewer ('rerun' prints its address) and give rerun+http://HOST:9876/proxy, or a file *{SUFFIX}"
+        with ErrorsAs((RuntimeError, OSError, ValueError), lambda error: DeviceError(f"{told} ({error}); {remedy}")):
             if self._target == VIEWER:
                 stream.spawn()
             elif "://" in self._target:
@@ -94,9 +95,6 @@ class RerunView:
                 Path(self._target).parent.mkdir(parents=True, exist_ok=True)
                 stream.save(self._target)
             stream.flush(timeout_sec=ANSWER_S)  # connecting itself reports no error, but flushing does
-        except (RuntimeError, OSError, ValueError) as error:
-            remedy = "start a viewer ('rerun' prints its address) and give rerun+http://HOST:9876/proxy, or a file"
-            raise DeviceError(f"`rerun` {self._target}: can't be opened ({error}); {remedy} *{SUFFIX}") from error
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -447,11 +445,10 @@ def watch(
             session.record = stack.enter_context(SessionWriter(plan.record, about))
             if rest is not None:
                 session.record.keep_rest(rest)
-        interrupted = False
-        try:
+        interrupted = True
+        with suppress(KeyboardInterrupt):
             session.run(most=plan.count, seconds=plan.seconds, rate_hz=plan.rate or np.inf, going=lambda: shower is None or shower.open)
-        except KeyboardInterrupt:
-            interrupted = True
+            interrupted = False
         same = (same_estimates(source.session.steps, found), len(found)) if isinstance(source, SessionSource) else None
         return WatchResult(session.timing(), interrupted, same, plan.record, session.count, source.notes(), session.valid, session.invalid)
 

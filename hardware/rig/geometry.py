@@ -116,7 +116,6 @@ def path_around(placed: PlacedObject, start: np.ndarray, clear: np.ndarray) -> l
     surface = outline @ placed.T_base_object[:2, [0, 2]].T + placed.T_base_object[:2, 3]
     middle = (surface.min(axis=0) + surface.max(axis=0)) / 2
     radius_mm = np.linalg.norm(surface - middle, axis=1).max() + placed.mounting.skin_reach_mm + MARGIN_MM
-    T = matrix_of(clear)
     domes = [matrix_of(pose)[:2, :3] @ placed.mounting.centre_mm + pose[:2] - middle for pose in (start, clear)]
     if distance_to_axis(*domes) >= min(radius_mm, np.linalg.norm(domes[1])):
         return [clear]
@@ -130,7 +129,7 @@ def path_around(placed: PlacedObject, start: np.ndarray, clear: np.ndarray) -> l
         last[:2] += inside_mm * np.array([np.cos(angle), np.sin(angle)])
         way.append(last)
     for at in np.linspace(turn, 0.0, int(np.ceil(abs(np.degrees(turn)) / STEP_DEG)) + 1):
-        spun = _spun(T, at, middle)
+        spun = _spun(matrix_of(clear), at, middle)
         spun[:2, 3] += outward_mm * np.array([np.cos(end + at), np.sin(end + at)])
         last = pose_of(spun, last)
         way.append(last)

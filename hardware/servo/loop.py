@@ -80,19 +80,17 @@ def tangent_of(mounting: Mounting, pose: np.ndarray, reading: Reading) -> np.nda
         The arm's pose when the frame was exposed.
     reading : Reading
     """
-    axis, out_of_plane = mounting.axis, mounting.out_of_plane
     T = matrix_of(pose)
-    T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(-np.radians(reading.angle_deg) * out_of_plane).as_matrix()
-    T[:3, 3] -= reading.depth_mm * (T[:3, :3] @ axis)
+    T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(-np.radians(reading.angle_deg) * mounting.out_of_plane).as_matrix()
+    T[:3, 3] -= reading.depth_mm * (T[:3, :3] @ mounting.axis)
     return T
 
 
 def reading_at(mounting: Mounting, T_base_surface: np.ndarray, pose: np.ndarray) -> Reading:
     """Depth and angle of a tool at a pose (6,) against a tangent (4, 4)."""
-    axis, out_of_plane = mounting.axis, mounting.out_of_plane
     seen = np.linalg.inv(T_base_surface) @ matrix_of(pose)
     turn = Rotation.from_matrix(seen[:3, :3]).as_rotvec(degrees=True)
-    return Reading(float(axis @ seen[:3, 3]), float(out_of_plane @ turn))
+    return Reading(float(mounting.axis @ seen[:3, 3]), float(mounting.out_of_plane @ turn))
 
 
 def servo_step(

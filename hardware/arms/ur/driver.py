@@ -104,10 +104,10 @@ class UrKinematics(StageKinematics):
         return joints - FULL_TURN_DEG * np.trunc(joints / (FULL_TURN_DEG + LIMIT_TOLERANCE_DEG))
 
     def violation(self, joints_deg: np.ndarray) -> Violation | None:
-        beyond = np.flatnonzero(np.abs(joints_deg) > FULL_TURN_DEG + LIMIT_TOLERANCE_DEG)
-        return (
-            Violation(TARGET_LIMIT, f"J{beyond[0] + 1} at {joints_deg[beyond[0]]:.2f} deg is beyond a full turn") if beyond.size else None
-        )
+        for n, angle in enumerate(joints_deg, start=1):
+            if abs(angle) > FULL_TURN_DEG + LIMIT_TOLERANCE_DEG:
+                return Violation(TARGET_LIMIT, f"J{n} at {angle:.2f} deg is beyond a full turn")
+        return None
 
     def _arccos(self, cosine: float, pose: np.ndarray) -> float:
         if not abs(cosine) <= 1.0 + STRAIGHT:

@@ -8,7 +8,8 @@ import errno
 import re
 import socket
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Self
 
@@ -33,10 +34,9 @@ class StaleDataError(DeviceError):
 
 def cannot_listen(who: str, host: str, port: int, error: OSError, *, option: str = "`port`") -> DeviceError:
     """The error of a server that can't listen. It names the address, the reason and the remedy; ``option`` is the option for the port."""
-    foreign = isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL
-    remedy = (
-        "give an address of this machine with `host`, such as 127.0.0.1" if foreign else f"end what uses the port, or give another {option}"
-    )
+    remedy = f"end what uses the port, or give another {option}"
+    if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
+        remedy = "give an address of this machine with `host`, such as 127.0.0.1"
     return DeviceError(f"{who}: can't listen on {host}:{port} ({error.strerror}); {remedy}")
 
 
@@ -96,6 +96,16 @@ def undo(act: Callable[[], object], error: BaseException) -> None:
         act()
     except DeviceError as failed:
         also(error, str(failed))
+
+
+@contextmanager
+def on_error(act: Callable[[], object]) -> Iterator[None]:
+    """Context that stops, releases or switches off something after any error, Ctrl-C included. If that fails, it is added to the error."""
+    try:
+        yield
+    except BaseException as error:
+        undo(act, error)
+        raise
 
 
 # Longest line about an arm or a camera, in characters. Longer messages, and notes, go to a file.

@@ -34,7 +34,7 @@ from twin.lazy import WhenImported, offered_name
 
 _OFFERED = {
     "hardware.arms.open_arm": ("open_arm",),
-    "hardware.cameras.choose": ("open_camera",),
+    "hardware.cameras.source": ("open_camera",),
     "hardware.safety.decide": ("load_limits",),
     "hardware.safety.safe_arm": ("SafeArm",),
     "scenes": ("load_experiment", "load_object", "load_sensor"),

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from hardware.arms.open_arm import open_arm as open_arm
-from hardware.cameras.choose import open_camera as open_camera
+from hardware.cameras.source import open_camera as open_camera
 from hardware.collect.collect import Collected as Collected
 from hardware.collect.record import RecordedFrames as RecordedFrames
 from hardware.live.examining import Examination as Examination

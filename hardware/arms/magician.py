@@ -1,9 +1,13 @@
-"""Driver of the Dobot Magician over its serial port."""
+"""Driver of the Dobot Magician over its serial port.
+
+A message on the line is ``AA AA | len | id | ctrl | params | checksum``. The emulator uses these messages too.
+"""
 
 import contextlib
 import struct
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from enum import IntEnum
 from threading import RLock
 
 import numpy as np
@@ -12,12 +16,129 @@ from serial.tools import list_ports
 
 from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, KinematicArm
 from hardware.arms.awake import awake_s
-from hardware.arms.dobot_alarms import explain
-from hardware.arms.kinematics import MAGICIAN, LinkageKinematics
-from hardware.arms.magician_wire import BAUD, QUEUED, USB_VENDORS, WRITE, Id, Message, Ptp, take_message
+from hardware.arms.motion import MAGICIAN, LinkageKinematics, explain
 from hardware.arms.supervisor import Supervisor
-from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
+from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError, on_error
 from twin.errors import ErrorsAs
+
+BAUD = 115200  # 8N1
+USB_VENDORS = {4292: "CP210x", 6790: "CH340"}
+HEADER = b"\xaa\xaa"
+LENGTH_LIMIT = 0xAA  # every length is below 0xAA, so AA AA AA is never a header followed by a length
+WRITE, QUEUED = 1, 2  # bits of the ctrl byte
+
+
+class Id(IntEnum):
+    """Commands."""
+
+    GET_POSE = 10
+    RESET_POSE = 11
+    ALARMS = 20  # read: the state; write: clear them (the manual prints 21, devices use 20)
+    HOME_PARAMS = 30
+    HOME = 31
+    HANDHELD_OUTPUT = 41
+    END_EFFECTOR = 60
+    LASER = 61
+    SUCTION = 62
+    GRIPPER = 63
+    JOG_JOINT_PARAMS = 70
+    JOG_COORDINATE_PARAMS = 71
+    JOG_COMMON_PARAMS = 72
+    JOG = 73
+    PTP_JOINT_PARAMS = 80
+    PTP_COORDINATE_PARAMS = 81
+    PTP_JUMP_PARAMS = 82
+    PTP_COMMON_PARAMS = 83
+    PTP = 84
+    CP_PARAMS = 90
+    CP = 91
+    CP_LASER = 92
+    ARC_PARAMS = 100
+    ARC = 101
+    WAIT = 110
+    IO = 131
+    MOTOR = 135  # of a conveyor or a slide
+    MOTOR_STEPS = 136
+    COLOR = 137
+    INFRARED = 138
+    QUEUE_START = 240
+    QUEUE_STOP = 241
+    QUEUE_FORCE_STOP = 242
+    QUEUE_CLEAR = 245
+    QUEUE_INDEX = 246
+    QUEUE_SPACE = 247
+
+
+class Ptp(IntEnum):
+    """Modes of a point-to-point command."""
+
+    JUMP_XYZ = 0
+    MOVJ_XYZ = 1
+    MOVL_XYZ = 2
+    JUMP_ANGLE = 3
+    MOVJ_ANGLE = 4
+    MOVL_ANGLE = 5
+    MOVJ_INC = 6
+    MOVL_INC = 7
+    MOVJ_XYZ_INC = 8
+    JUMP_MOVL_XYZ = 9
+
+
+@dataclass(frozen=True)
+class Message:
+    """The content of one frame."""
+
+    id: int
+    ctrl: int = 0
+    params: bytes = b""
+
+    @property
+    def is_write(self) -> bool:
+        """Whether the message sets something."""
+        return bool(self.ctrl & WRITE)
+
+    @property
+    def is_queued(self) -> bool:
+        """Whether the command goes through the arm's queue."""
+        return bool(self.ctrl & QUEUED)
+
+    def to_bytes(self) -> bytes:
+        """The frame; ``ValueError`` if the parameters are too long for one."""
+        length = 2 + len(self.params)
+        if length >= LENGTH_LIMIT:
+            raise ValueError(f"{len(self.params)} bytes of parameters; a frame holds at most {LENGTH_LIMIT - 3}")
+        body = bytes([self.id, self.ctrl]) + self.params
+        return HEADER + bytes([length]) + body + bytes([checksum(body)])
+
+
+def checksum(body: bytes) -> int:
+    """Two's complement of the sum of id, ctrl and params."""
+    return -sum(body) & 0xFF
+
+
+def take_message(buffer: bytes) -> tuple[Message | None, bytes]:
+    """The first valid frame in the received bytes, and the remaining bytes.
+
+    Noise and frames with a wrong checksum are skipped. AA may occur within the parameters, so only a whole frame
+    with a correct checksum counts. Bytes that may be the beginning of a frame are kept.
+    """
+    start, unfinished = buffer.find(HEADER), None
+    while start >= 0:
+        if start + 3 > len(buffer):
+            unfinished = start if unfinished is None else unfinished
+            break
+        end = start + 3 + buffer[start + 2] + 1
+        if 2 <= buffer[start + 2] < LENGTH_LIMIT:
+            body = buffer[start + 3 : end - 1]
+            if end <= len(buffer) and buffer[end - 1] == checksum(body):
+                return Message(body[0], body[1], body[2:]), buffer[end:]
+            if end > len(buffer) and unfinished is None:
+                unfinished = start
+        start = buffer.find(HEADER, start + 1)
+    if unfinished is not None:
+        return None, buffer[unfinished:]
+    return None, buffer[-1:] if buffer.endswith(HEADER[:1]) else b""
+
 
 # Longest wait for a reply, in s. A reply usually takes about 10 ms. All tries together take as long as feedback may be old.
 REPLY_TIMEOUT_S = 0.2
@@ -44,6 +165,16 @@ ACCELERATION = 4.0
 def attached_ports() -> list[str]:
     """The ports of attached USB adapters of a Magician's kind."""
     return [port.device for port in list_ports.comports() if port.vid in USB_VENDORS]
+
+
+def attached_port() -> str:
+    """The port of the only attached adapter of a Magician's kind; ``DeviceError`` if there are none or several."""
+    found = attached_ports()
+    if len(found) != 1:
+        adapters = f"{len(found) or 'no'} serial adapters of a Magician's kind ({', '.join(USB_VENDORS.values())})"
+        there = ", ".join(found) or "plug in its USB cable"
+        raise DeviceError(f"{adapters} are attached: {there}; name one, for example magician:/dev/ttyUSB0")
+    return found[0]
 
 
 class Magician(KinematicArm):
@@ -85,17 +216,13 @@ class Magician(KinematicArm):
         try:
             self._serial = serial.Serial(self._port_name, BAUD, timeout=0.05, write_timeout=REPLY_TIMEOUT_S, exclusive=True)
         except PORT_ERRORS as error:
-            raise DeviceNotConnectedError(
-                f"{self.name}: can't open the port ({error}); Magicians attached: {', '.join(attached_ports()) or 'none'}. Plug in the USB "
-                "cable and switch the arm on; on Linux the user must be in the group 'dialout'; and no other program may hold the port; "
-                "without an arm: 'twin emulate magician'"
-            ) from error
-        try:
+            there = f"Magicians attached: {', '.join(attached_ports()) or 'none'}. Plug in the USB cable and switch the arm on"
+            remedy = "on Linux the user must be in the group 'dialout'; and no other program may hold the port"
+            emulated = "without an arm: 'twin emulate magician'"
+            raise DeviceNotConnectedError(f"{self.name}: can't open the port ({error}); {there}; {remedy}; {emulated}") from error
+        with on_error(self._close):
             self._buffer = b""
             self._request(Id.GET_POSE)
-        except BaseException:
-            self._close()
-            raise
 
     def disconnect(self) -> None:
         if self.is_connected:
@@ -158,7 +285,7 @@ class Magician(KinematicArm):
         return ArmState(pose, values[4:], begun_s, self._enabled, moving, explain(alarms) if alarms else "")
 
     def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
-        self._require_speeds(linear_mm_s, angular_deg_s)
+        super().set_speed(linear_mm_s, angular_deg_s)
         line = (linear_mm_s, angular_deg_s, ACCELERATION * linear_mm_s, ACCELERATION * angular_deg_s)
         joints = [angular_deg_s] * 4 + [ACCELERATION * angular_deg_s] * 4
         self._request(Id.PTP_COORDINATE_PARAMS, struct.pack("<4f", *line), ctrl=WRITE)
@@ -181,10 +308,7 @@ class Magician(KinematicArm):
     def _await_queue(self, timeout_s: float) -> None:
         deadline = time.monotonic() + timeout_s
         while (state := self.state()).moving or state.error:
-            if state.error:
-                raise DeviceError(f"{self.name}: stopped on the way: {state.error}")
-            if time.monotonic() > deadline:
-                raise self._too_long(timeout_s)
+            self._require_on_way(state, deadline, timeout_s)
             time.sleep(POLL_S)
 
     def _forget_queue(self) -> None:
@@ -229,15 +353,11 @@ class Magician(KinematicArm):
                     continue
                 except PORT_ERRORS as error:
                     self._close()
-                    self._lost = (
-                        f"{self.name}: the port vanished ({error}). The arm executes the moves in its queue: switch it off if it moves! "
-                        "Plug the cable in, then connect() again"
-                    )
+                    moves = "The arm executes the moves in its queue: switch it off if it moves! Plug the cable in, then connect() again"
+                    self._lost = f"{self.name}: the port vanished ({error}). {moves}"
                     raise DeviceNotConnectedError(self._lost) from error
-        raise DeviceError(
-            f"{self.name}: no valid reply to command {int(id)} in {tries} tries of {REPLY_TIMEOUT_S:g} s; switch the arm on, "
-            "check that the port is a Magician's and the cable is sound"
-        )
+        remedy = "switch the arm on, check that the port is a Magician's and the cable is sound"
+        raise DeviceError(f"{self.name}: no valid reply to command {int(id)} in {tries} tries of {REPLY_TIMEOUT_S:g} s; {remedy}")
 
     def _port(self) -> serial.Serial:
         """The open port; ``DeviceNotConnectedError`` where there is none."""
@@ -263,10 +383,8 @@ class Magician(KinematicArm):
             message, self._buffer = take_message(self._buffer)
             while message is not None:
                 if (message.id, message.ctrl) == (id, ctrl) and wanted not in (None, len(message.params)):
-                    raise DeviceError(
-                        f"{self.name}: replied {len(message.params)} bytes to command {int(id)} instead of {wanted}: the device echoes its "
-                        "input, or is no Magician. Give the port of the arm"
-                    )
+                    said = f"replied {len(message.params)} bytes to command {int(id)} instead of {wanted}"
+                    raise DeviceError(f"{self.name}: {said}: the device echoes its input, or is no Magician. Give the port of the arm")
                 if (message.id, message.ctrl) == (id, ctrl):
                     return message
                 message, self._buffer = take_message(self._buffer)

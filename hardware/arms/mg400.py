@@ -8,13 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hardware.arms import kinematics as arms
 from hardware.arms import mg400_wire as wire
+from hardware.arms import motion
 from hardware.arms.arm import POLL_S, ArmState, KinematicArm
-from hardware.arms.dobot_alarms import explain
-from hardware.arms.kinematics import LinkageKinematics
-from hardware.arms.mg400_link import REPLY_TIMEOUT_S, SILENCE_S, CommandPort, Feedback, NoReplyError
-from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
+from hardware.arms.mg400_wire import REPLY_TIMEOUT_S, SILENCE_S, CommandPort, Feedback, NoReplyError
+from hardware.arms.motion import LinkageKinematics, explain
+from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError, on_error
 
 LOG = logging.getLogger(__name__)
 # Longest wait in s until feedback shows that the arm is enabled, or that an alarm is cleared.
@@ -87,7 +86,7 @@ class MG400(KinematicArm):
         host: str = wire.DEFAULT_HOSTS["LAN1"],
         *,
         ports: Mg400Ports = Mg400Ports(),  # noqa: B008  (frozen)
-        kinematics: LinkageKinematics = arms.MG400,
+        kinematics: LinkageKinematics = motion.MG400,
         lenient: bool = False,
         supervised: bool = True,
     ) -> None:
@@ -97,15 +96,15 @@ class MG400(KinematicArm):
         self._motion = CommandPort(self.name, host, ports.motion)
         self._feedback = Feedback(self.name, host, ports.feedback, lenient=lenient)
         self._lenient = lenient
-        self._in_use = False  # true from connect to disconnect, even if the connection is lost in between
+        # whether it is in use: from connect to disconnect, even if the connection is lost in between; whether this driver has enabled it
+        # and not disabled it since; whether a move was sent whose end feedback has not shown yet; and whether late replies to moves may
+        # arrive for which no call waits any more
+        self._in_use = self._enabled = self._under_way = self._late_replies = False
         self._bare = False  # whether moves have no reply: old firmware, which only echoes on the dashboard, and some emulators
         self._alarm_text: str | None = None
         self._speed: tuple[float, float] | None = None  # mm/s and deg/s; None after speeds were set in percent
         self._sent: np.ndarray | None = None  # end of the queue while the arm may still move there
-        self._enabled = False  # whether this driver has enabled the arm and not disabled it since
-        self._under_way = False  # whether a move was sent whose end feedback has not shown yet
         self._mute_s = -np.inf  # time of the newest failed stop, emergency stop or disable
-        self._late_replies = False  # whether late replies to moves may arrive for which no call waits any more
 
     @property
     def is_connected(self) -> bool:
@@ -114,15 +113,12 @@ class MG400(KinematicArm):
     def connect(self) -> None:
         self._require_disconnected()
         self._close()  # remains of a lost connection
-        try:
+        with on_error(self._close):
             self._dashboard.open()
             self._motion.open()
             self._feedback.open()
             self._bare = self._ask("GetErrorID()").error_id is None  # the query that emulators know, too
             self._in_use = True
-        except BaseException:
-            self._close()
-            raise
 
     def disconnect(self) -> None:
         if self._in_use and (self._enabled or self._under_way):
@@ -135,12 +131,11 @@ class MG400(KinematicArm):
         if self._mode() == wire.Mode.ERROR:
             raise DeviceError(f"{self.name}: {self._alarm()}")
         if self._mode() in ENABLED_MODES and not self._enabled:
-            LOG.warning(
-                "%s: is enabled already, so another program may use it; a stop or disable of one program is one for both", self.name
-            )
+            shared = "is enabled already, so another program may use it; a stop or disable of one program is one for both"
+            LOG.warning("%s: %s", self.name, shared)
         if self._supervised and not self._enabled:
             self._dashboard.supervise(*LAST_WORDS)
-        with self._watch_enabling():
+        with on_error(self.disable):  # it may have obeyed
             self._enabled = True  # from now on it may be, even if nothing is heard of it
             for request in ("EnableRobot()", "User(0)", "Tool(0)"):
                 self._ask(request)
@@ -178,9 +173,8 @@ class MG400(KinematicArm):
                     self.emergency_stop()
                 except DeviceError:
                     raise error from None
-                raise DeviceError(
-                    f"{self.name}: did not stop, so its emergency stop was used; call clear_error() and enable(). {error}"
-                ) from error
+                remedy = "call clear_error() and enable()"
+                raise DeviceError(f"{self.name}: did not stop, so its emergency stop was used; {remedy}. {error}") from error
         self._unstopped = self._under_way = False
 
     def _shows(self, obeyed: Callable[[np.void], bool], *, within_s: float = SHOWS_S) -> bool:
@@ -188,7 +182,7 @@ class MG400(KinematicArm):
         asked_s, since_s = time.monotonic(), np.inf
         with contextlib.suppress(StaleDataError):
             while time.monotonic() - asked_s < within_s:
-                packet, time_s = self._feedback.newest(SHOWS_S)
+                packet, time_s = self._feedback.newest(SILENCE_S if within_s > SHOWS_S else SHOWS_S)
                 since_s = min(since_s, time_s) if time_s > asked_s and obeyed(packet) else np.inf
                 if time_s - since_s >= RESTED_S:
                     return True
@@ -208,14 +202,8 @@ class MG400(KinematicArm):
         mode = int(packet["mode"])
         if mode != wire.Mode.ERROR:
             self._alarm_text = None
-        return ArmState(
-            pose,
-            packet["q_actual"][:4].copy(),
-            time_s,
-            mode in ENABLED_MODES,
-            mode in MOVING_MODES or (self._lenient and time.monotonic() - self._feedback.turned_s < RESTED_S),
-            self._trouble(mode),
-        )
+        moving = mode in MOVING_MODES or (self._lenient and time.monotonic() - self._feedback.turned_s < RESTED_S)
+        return ArmState(pose, packet["q_actual"][:4].copy(), time_s, mode in ENABLED_MODES, moving, self._trouble(mode))
 
     def _trouble(self, mode: int) -> str:
         """The arm's fault in a mode, in words; "" if there is none."""
@@ -230,7 +218,7 @@ class MG400(KinematicArm):
 
         In a linear move the turn may also reach the given angular speed, even if the move is short.
         """
-        self._require_speeds(linear_mm_s, angular_deg_s)
+        super().set_speed(linear_mm_s, angular_deg_s)
         self.set_speed_percent(linear=100 * linear_mm_s / wire.MAX_LINEAR_MM_S, angular=100 * angular_deg_s / wire.MAX_JOINT_DEG_S)
         self._speed = linear_mm_s, angular_deg_s
 
@@ -327,13 +315,10 @@ class MG400(KinematicArm):
                 self._late_replies = False
                 return
             state = self.state()
-            if state.error:
-                raise DeviceError(f"{self.name}: stopped on the way: {state.error}")
+            self._require_on_way(state, deadline, timeout_s)
             rest_since = None if state.moving or state.time_s < asked_s else rest_since or state.time_s
             if not syncs and rest_since is not None and state.time_s - rest_since > RESTED_S:
                 return
-            if time.monotonic() > deadline:
-                raise self._too_long(timeout_s)
             if not syncs:
                 time.sleep(POLL_S)
 
@@ -347,14 +332,8 @@ class MG400(KinematicArm):
 
     def _await_mode(self, reached: Callable[[int], bool], otherwise: str) -> None:
         """Wait for feedback newer than this call whose mode is one of the wanted modes."""
-        asked_s = time.monotonic()
-        while True:
-            packet, time_s = self._feedback.newest(SILENCE_S)
-            if time_s > asked_s and reached(int(packet["mode"])):
-                return
-            if time.monotonic() - asked_s > ENABLE_TIMEOUT_S:
-                raise DeviceError(f"{self.name}: {otherwise} (mode {int(packet['mode'])})")
-            time.sleep(POLL_S)
+        if not self._shows(lambda packet: reached(int(packet["mode"])), within_s=ENABLE_TIMEOUT_S):
+            raise DeviceError(f"{self.name}: {otherwise} (mode {self._mode()})")
 
     def _mode(self) -> int:
         return int(self._feedback.newest(SILENCE_S)[0]["mode"])

@@ -1,12 +1,10 @@
 """Makes an arm of any kind from its specification: ``open_arm("mg400:192.168.1.6")``."""
 
-from hardware.arms.arm import Arm
-from hardware.arms.magician import Magician, attached_ports
-from hardware.arms.magician_wire import USB_VENDORS
+from hardware.arms.arm import Arm, SimulatedArm
+from hardware.arms.magician import Magician, attached_port
 from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.arms.mg400_wire import DEFAULT_HOSTS, address_of
 from hardware.arms.ros2 import ARM_FORM, ros2_arm
-from hardware.arms.simulated import SimulatedArm
 from hardware.arms.ur.driver import UR
 from hardware.errors import DeviceError
 from scenes.files import quote
@@ -41,7 +39,7 @@ def open_arm(spec: str) -> Arm:
         host, offset = address_of(rest)
         return MG400(host or DEFAULT_HOSTS["LAN1"], ports=Mg400Ports().shift_ports(offset), lenient=kind == "mg400-lenient")
     if kind == "magician":
-        return Magician(rest or _attached_magician())
+        return Magician(rest or attached_port())
     if kind == "ros2":
         return ros2_arm(rest)
     if kind == "ur" and rest:
@@ -56,13 +54,3 @@ def open_arm(spec: str) -> Arm:
 def kind_of(spec: str) -> str:
     """The kind of an arm by its specification: ``mg400``, ``magician``, ``ros2``, ``ur`` or ``simulated``."""
     return spec.partition(":")[0].removesuffix("-lenient")
-
-
-def _attached_magician() -> str:
-    found = attached_ports()
-    if len(found) != 1:
-        raise DeviceError(
-            f"{'no' if not found else len(found)} serial adapters of a Magician's kind ({', '.join(USB_VENDORS.values())}) are attached: "
-            f"{', '.join(found) or 'plug in its USB cable'}; name one, for example magician:/dev/ttyUSB0"
-        )
-    return found[0]

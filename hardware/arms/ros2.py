@@ -16,9 +16,8 @@ from threading import Event, Lock, Thread
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, BaseArm
-from hardware.arms.kinematics import StageKinematics, finite_numbers
-from hardware.arms.motion import MotionTrack, Speeds
+from hardware.arms.arm import FEEDBACK_AGE_S, POLL_S, ArmState, BaseArm, happens
+from hardware.arms.motion import MotionTrack, Speeds, StageKinematics, finite_numbers
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 from hardware.ros2.dds import Participant, Reader, Writer, domain_id
 from scenes.files import quote
@@ -71,6 +70,8 @@ class Ros2Arm(BaseArm):
         Topics; an empty one is the usual one of the form.
     """
 
+    _speeds = Speeds(50.0, 30.0, ACCELERATION, ACCELERATION)
+
     def __init__(
         self, form: str, *, axes: int = 6, namespace: str = "", pose: str = "current_pose", joints: str = "joint_states", command: str = ""
     ) -> None:
@@ -81,7 +82,6 @@ class Ros2Arm(BaseArm):
         self._writer: Writer | None = None
         self._enabled = self._going = False
         self._fault, self._frame = "", ""
-        self._speed = np.array([50.0, 30.0])  # mm/s, deg/s
         self._forget()
 
     def _forget(self) -> None:
@@ -104,16 +104,12 @@ class Ros2Arm(BaseArm):
         given = (participant.reader(pose, POSE), participant.reader(joints, JOINTS), writer, self._end)
         self._thread = Thread(target=self._run, args=given, daemon=True, name="ROS 2 arm")
         self._thread.start()
-        until_s = time.monotonic() + CONNECT_S
-        while not (self._pose_s > 0 < self._joints_s and writer.heard):
-            if time.monotonic() > until_s:
-                self._close()
-                raise DeviceNotConnectedError(
-                    f"{self.name}: not found in domain {domain_id()}: it needs poses on {pose}, {self.axes} joints on {joints}, and a node "
-                    f"that takes {self._kind} on {command}; start them, or name other topics ({ARM_FORM}); without an arm: "
-                    f"'twin emulate ros2'. There are: {', '.join(participant.topics()) or 'no topics'}"
-                )
-            time.sleep(POLL_S)
+        if not happens(lambda: self._pose_s > 0 < self._joints_s and writer.heard, CONNECT_S):
+            self._close()
+            needs = f"poses on {pose}, {self.axes} joints on {joints}, and a node that takes {self._kind} on {command}"
+            remedy = f"start them, or name other topics ({ARM_FORM}); without an arm: 'twin emulate ros2'"
+            there = ", ".join(participant.topics()) or "no topics"
+            raise DeviceNotConnectedError(f"{self.name}: not found in domain {domain_id()}: it needs {needs}; {remedy}. There are: {there}")
         self._writer = writer
         LOG.warning("%s: the network guarantees nothing and no emergency stop is behind it; keep a hand at the arm's own", self.name)
 
@@ -158,34 +154,29 @@ class Ros2Arm(BaseArm):
         with self._lock:
             if not self._fault:  # which held it
                 self._hold()
-        asked_s, until_s = time.monotonic(), time.monotonic() + STOPS_S
+        asked_s = time.monotonic()
         why = "can't be stopped and may move. Press its emergency stop"
         with ErrorsAs(DeviceError, lambda error: type(error)(f"{self.name}: {why}. {error}")):
-            while self.state(max_age_s=SILENCE_S).time_s - max(self._rest_s, asked_s) < REST_S:
-                if time.monotonic() > until_s:
-                    raise DeviceError(f"It moves {STOPS_S:g} s after a stop")
-                time.sleep(POLL_S)
+            if not happens(lambda: self.state(max_age_s=SILENCE_S).time_s - max(self._rest_s, asked_s) >= REST_S, STOPS_S):
+                raise DeviceError(f"It moves {STOPS_S:g} s after a stop")
         self._unstopped = False
 
     def state(self, *, max_age_s: float = FEEDBACK_AGE_S) -> ArmState:
         """See ``Arm``. It moves if its poses show that, or until it has reached the end of the path."""
         self._require_connected()
-        asked_s = time.monotonic()
-        while (age_s := time.monotonic() - self._pose_s) > max_age_s and time.monotonic() - asked_s < 5 * PERIOD_S:
-            time.sleep(POLL_S)  # after a stall of this process
-        if age_s > max_age_s:
-            raise StaleDataError(
-                f"{self.name}: newest pose is {age_s:.1f} s old (allowed {max_age_s:g} s). Don't trust it: stop the arm, check its node "
-                "and the network, then disconnect() and connect() again"
-            )
+        # after a stall of this process it waits for what arrived meanwhile
+        if not happens(lambda: time.monotonic() - self._pose_s <= max_age_s, 5 * PERIOD_S):
+            old = f"newest pose is {time.monotonic() - self._pose_s:.1f} s old (allowed {max_age_s:g} s)"
+            remedy = "stop the arm, check its node and the network, then disconnect() and connect() again"
+            raise StaleDataError(f"{self.name}: {old}. Don't trust it: {remedy}")
         with self._lock:
             self._require_possible(self._pose)
             moving = self._going or self._pose_s - self._rest_s < REST_S
             return ArmState(self._pose, self._joints, self._pose_s, self._enabled, moving, self._fault)
 
-    def set_speed(self, linear_mm_s: float, angular_deg_s: float) -> None:
-        self._require_speeds(linear_mm_s, angular_deg_s)
-        self._speed = np.array([linear_mm_s, angular_deg_s])
+    @property
+    def _speed(self) -> np.ndarray:
+        return np.array([self._speeds.linear_mm_s, self._speeds.angular_deg_s])
 
     def move_linear(self, pose: np.ndarray, *, wait: bool = True, timeout_s: float = 10.0) -> np.ndarray:
         with self._watch_move():
@@ -196,9 +187,7 @@ class Ros2Arm(BaseArm):
                     raise DeviceError(f"{self.name}: {self._fault or 'not enabled'}; call clear_error() and enable()")
                 if not self._going:
                     self._hold()
-                self._track.move(
-                    sent, Speeds(self._speed[0], self._speed[1], ACCELERATION, ACCELERATION), linear=True, now_s=time.monotonic()
-                )
+                self._track.move(sent, self._speeds, linear=True, now_s=time.monotonic())
                 self._going = True
             if wait:
                 self._wait_until_settled(sent, timeout_s=timeout_s)

@@ -23,7 +23,7 @@ import numpy as np
 
 from hardware.cameras import reader
 from hardware.cameras.reader import DevicePicture, LiveSource, ReadFailed, TornPicture
-from hardware.errors import DeviceError, cannot_listen
+from hardware.errors import DeviceError, cannot_listen, on_error
 from scenes.files import quote
 from scenes.sensor import SensorSpec
 from twin.errors import ErrorsAs, FrameError
@@ -42,9 +42,9 @@ LONGEST_HEADER = 65_536
 CLOCK_SLACK_S = 60.0
 # First bytes of a JPEG and of a PNG, and the last bytes of a PNG.
 JPEG, PNG, PNG_END = b"\xff\xd8", b"\x89PNG\r\n\x1a\n", b"IEND\xae\x42\x60\x82"
-# Second bytes of a JPEG's markers: start and end of a picture, start of a scan, those without content, and those inside a scan.
-_START, _END, _SCAN = 0xD8, 0xD9, 0xDA
-_BARE, _IN_SCAN = (0x01, *range(0xD0, 0xD9)), (0x00, *range(0xD0, 0xD8), 0xFF)
+# A JPEG's markers but those without content and those inside a scan; and its start and end.
+_MARKER = re.compile(rb"\xff([^\x00\x01\xd0-\xd7\xff])")
+_START, _END = 0xD8, 0xD9
 # Time, s, without a byte after which a read has failed.
 SILENT_S = 2.0
 # Pause, s, after which the address of a single picture is asked again.
@@ -95,22 +95,12 @@ def picture_end(data: bytes | bytearray) -> int:
     """
     if data.startswith(PNG):
         return data.find(PNG_END) + len(PNG_END) if PNG_END in data else 0
-    at, scan = 2, False
-    while data.startswith(JPEG):
-        at = data.find(0xFF, at)
-        if at < 0 or at + 1 >= len(data):
-            return 0
-        marker = data[at + 1]
-        if marker == _END:
-            return at + 2
-        if marker == _START:  # the next picture
-            return 0
-        if scan and marker in _IN_SCAN or marker in _BARE:
-            at += 1 if marker == 0xFF else 2
-            continue
-        if at + 3 >= len(data):
-            return 0
-        at, scan = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big"), marker == _SCAN
+    at = len(JPEG) if data.startswith(JPEG) else len(data)
+    while found := _MARKER.search(data, at):
+        at = found.end()
+        if found[1][0] in (_START, _END):  # a start is that of the next picture
+            return at if found[1][0] == _END else 0
+        at += int.from_bytes(data[at : at + 2], "big")
     return 0
 
 
@@ -301,11 +291,8 @@ class MjpegCamera(LiveSource):
             data = answer.read()
             self._close()
             if data != self._before:
-                try:
+                with on_error(lambda: self._end.wait(reader.FAILED_PAUSE_S)):  # it may be about to be replaced
                     image, note = decode_picture(data)
-                except TornPicture:
-                    self._end.wait(reader.FAILED_PAUSE_S)  # it may be about to be replaced
-                    raise
                 self._before = data
                 return DevicePicture(image, begun_s, 0, note)
             if time.monotonic() > until_s:
@@ -354,6 +341,8 @@ class JpegServer(ThreadingHTTPServer):
     host : str
     port : int
         Port; 0 for a free one, see ``url``.
+    refuses : callable, optional
+        Whether no client is served at present.
 
     Attributes
     ----------
@@ -367,10 +356,10 @@ class JpegServer(ThreadingHTTPServer):
 
     page, line = "", ""
 
-    def __init__(self, who: str, host: str, port: int) -> None:
+    def __init__(self, who: str, host: str, port: int, refuses: Callable[[], bool] = lambda: False) -> None:
         with ErrorsAs(OSError, lambda error: cannot_listen(who, host, port, error)):
             super().__init__((host, port), _Handler)
-        self.url = f"http://{host}:{self.server_port}/"
+        self.url, self.refuses = f"http://{host}:{self.server_port}/", refuses
         self._new, self.newest, self.ended = threading.Condition(), StreamPart(0, b""), threading.Event()
         self._thread = threading.Thread(target=self.serve_forever, name=who, daemon=True)
 
@@ -399,10 +388,6 @@ class JpegServer(ThreadingHTTPServer):
             part = self.newest
         self.ended.wait(max(0.0, part.due_s - time.monotonic()))
         return part
-
-    def refuses(self) -> bool:
-        """Whether no client is served at present."""
-        return False
 
 
 class PicturePage(JpegServer):

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from hardware.arms.awake import awake_s
-from hardware.errors import Connection, DeviceError, StaleDataError
+from hardware.errors import Connection, DeviceError, StaleDataError, on_error
 from scenes.sensor import SensorSpec
 from twin.camera.capture import record
-from twin.errors import format_count
+from twin.errors import ErrorsAs, format_count
 from twin.frames.forms import form_named, frame_size, gray_levels
 from twin.types import Form, Frame
 
@@ -288,11 +288,9 @@ class LiveSource(Connection):
 
     def _again(self, open_device: Callable[[], None]) -> None:
         """Open a device that was lost; ``ReadFailed`` after a pause if it can't be opened."""
-        try:
+        failed = ErrorsAs((DeviceError, OSError), lambda error: ReadFailed(str(error)))
+        with on_error(lambda: self._end.wait(FAILED_PAUSE_S)), failed:
             open_device()
-        except (DeviceError, OSError) as error:
-            self._end.wait(FAILED_PAUSE_S)
-            raise ReadFailed(str(error)) from error
         self.reopened += 1
 
     def _may_repeat(self, image: np.ndarray) -> bool:

@@ -23,9 +23,8 @@ from hardware.arms.arm import ArmState
 from hardware.cameras.mjpeg import without_secrets
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject
-from hardware.workcell.build import Rig, build_rig, check_plan
-from hardware.workcell.mover import Mover
-from scenes import ObjectSpec, SensorSpec, ServoSpec
+from hardware.workcell.build import Mover, Rig, RigPlan, build_rig, check_plan
+from scenes import SensorSpec
 from scenes.experiment import LABELS, ExperimentSpec
 from scenes.files import quote
 from twin.errors import ErrorsAs, FrameError, format_count
@@ -108,10 +107,8 @@ class Collection:
         self.pictures.mkdir(exist_ok=True)
         for lines in (table, self.folder / LOG):
             if lines.is_file():
-                try:
+                with _damaged(lines):
                     text = lines.read_text(encoding="utf-8")
-                except ValueError as error:
-                    raise DeviceError(f"{lines}: is damaged ({quote(error)}); give another `out`") from error
                 if not text.endswith("\n"):  # the last line is torn
                     write_text(lines, text[: text.rfind("\n") + 1])
         if not table.is_file() or not table.read_text(encoding="utf-8"):
@@ -127,8 +124,7 @@ class Collection:
             The table is damaged.
         """
         table = self.folder / TABLE
-        damaged = ErrorsAs((ValueError, csv.Error), lambda error: DeviceError(f"{table}: is damaged ({quote(error)}); give another `out`"))
-        with damaged, table.open(newline="", encoding="utf-8") as file:
+        with _damaged(table), table.open(newline="", encoding="utf-8") as file:
             rows = list(csv.reader(file))
         if rows[:1] != [list(COLUMNS)] or any(len(row) != len(COLUMNS) for row in rows):
             raise DeviceError(f"{table}: is not the table of a collection; give another `out`")
@@ -156,6 +152,11 @@ class Collection:
             os.fsync(file.fileno())
 
 
+def _damaged(file: Path) -> ErrorsAs[Exception]:
+    """Context of reading a file of a collection, whose errors become a ``DeviceError``."""
+    return ErrorsAs((ValueError, csv.Error), lambda error: DeviceError(f"{file}: is damaged ({quote(error)}); give another `out`"))
+
+
 def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str = "random") -> PlannedContact:
     """Pose and move of contact ``index`` within the experiment's ranges. They depend only on these arguments.
 
@@ -166,14 +167,13 @@ def draw_contact(experiment: ExperimentSpec, seed: int, index: int, design: str 
     low, high = np.array(list(experiment.ranges().values())).T
     if design == "random":
         numbers = np.random.default_rng([seed, index]).uniform(low, high)
-        return PlannedContact(numbers[:6], numbers[6:])
-    from scipy.stats.qmc import Sobol
+    else:
+        from scipy.stats.qmc import Sobol
 
-    varied = high > low
-    sequence = Sobol(int(varied.sum()), scramble=True, rng=np.random.default_rng(seed))
-    shares = sequence.fast_forward(index).random(1)[0] if index else sequence.random(1)[0]
-    numbers = low.copy()
-    numbers[varied] += shares * (high - low)[varied]
+        numbers, varied = low.copy(), high > low
+        sequence = Sobol(int(varied.sum()), scramble=True, rng=np.random.default_rng(seed))
+        shares = sequence.fast_forward(index).random(1)[0] if index else sequence.random(1)[0]
+        numbers[varied] += shares * (high - low)[varied]
     return PlannedContact(numbers[:6], numbers[6:])
 
 
@@ -218,7 +218,6 @@ def collect(
     seed: int,
     design: str = "random",
     speed: tuple[float, float],
-    frame_timeout_s: float | None = None,
     on_rest: Callable[[Frame], None] | None = None,
     progress: Step = unheard,
 ) -> int:
@@ -238,8 +237,6 @@ def collect(
         See ``draw_contact``.
     speed : (float, float)
         Speed of the arm in mm/s and deg/s.
-    frame_timeout_s : float, optional
-        Longest wait in s for a frame while the arm stands still. By default that of the rig.
     on_rest : callable, optional
         Called with the frame without contact after it was kept.
     progress : Step, optional
@@ -261,7 +258,7 @@ def collect(
         raise DeviceError(f"{experiment.name}: its tap follows the tool's axes, but a collection taps along the work frame's; give another")
     if not rig.source.is_live:
         raise DeviceError(f"{rig.source.name}: a recording does not show this arm; give a live `camera`")
-    timeout_s = rig.frame_timeout_s if frame_timeout_s is None else frame_timeout_s
+    timeout_s = rig.frame_timeout_s
     stops = _Stops(Mover(rig, speed, clear_mm=CLEAR_MM, patience_s=timeout_s), WorkFrame(experiment, rig.placed), timeout_s)
     with output(collection.folder), stops.mover.watching():
         at_object = False
@@ -323,24 +320,18 @@ class _Stops:
         """The first frame exposed after a state."""
         remedy = "check the camera, then repeat the command to continue"
         with ErrorsAs(TimeoutError, lambda error: DeviceError(f"the arm stands still, but {error}; {remedy}")):
-            return self.mover.frame_after(state.time_s, timeout_s=self.frame_timeout_s)
+            return self.mover.watch.frame_after(self.mover.source, state.time_s, timeout_s=self.frame_timeout_s)
 
 
-@dataclass(frozen=True)
-class CollectPlan:
+@dataclass(frozen=True, kw_only=True)
+class CollectPlan(RigPlan):
     """Settings of a collection, and its devices.
 
     Attributes
     ----------
     sensor : SensorSpec
-    obj : ObjectSpec
-        The object that is touched.
     experiment : ExperimentSpec
         Experiment that defines the contacts.
-    servo : ServoSpec
-        The arm's speeds, and the object's place.
-    camera, arm : str
-        As for ``build_rig``.
     count : int
         Number of contacts in the folder at the end.
     seed : int or None
@@ -349,33 +340,16 @@ class CollectPlan:
         Distribution of the contacts over the experiment's ranges.
     form : Form or None
         Form of the frames. None: the form of the sensor's recordings if it has one.
-    limits : str or None
-        Safety limits, by name or file. None: those of the arm's kind.
-    plain_light : bool
-        Draw the twin's frames without path tracing; see ``build_rig``.
     also : tuple of str
         Further formats in which each contact is kept as soon as it is made, each in a subfolder.
-    dry_run : bool
-        End after the check of the plan, before anything moves.
-    ros2 : str or None
-        Namespace in which frames, pins and the arm's pose are published as ROS 2 topics.
     """
 
     sensor: SensorSpec
-    obj: ObjectSpec
     experiment: ExperimentSpec
-    servo: ServoSpec
-    camera: str
-    arm: str
     count: int
     seed: int | None = None
     design: str = "random"
     form: Form | None = None
-    limits: str | None = None
-    plain_light: bool = False
-    also: tuple[str, ...] = ()
-    dry_run: bool = False
-    ros2: str | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.count <= MOST_CONTACTS:
@@ -414,19 +388,7 @@ def collect_frames(plan: CollectPlan, out: Path, *, progress: Progress = silent)
         The frame without contact shows a contact, or not this sensor.
     """
     kept = KeptAlso(out, plan.also, plan.sensor)
-    rig = build_rig(
-        plan.sensor,
-        plan.obj,
-        plan.servo.placement,
-        plan.experiment,
-        camera=plan.camera,
-        arm=plan.arm,
-        form=plan.form,
-        limits=plan.limits,
-        seed=plan.sampling_seed,
-        plain_light=plan.plain_light,
-        at_once=True,
-    )
+    rig = build_rig(plan, plan.sensor, plan.experiment, form=plan.form, seed=plan.sampling_seed, at_once=True)
     collection = Collection(out, _about(plan, rig), rig.source.form)
     before = collection.count
 

@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from hardware.errors import DeviceError
+from hardware.errors import DeviceError, on_error
 from scenes.files import quote
 from twin.errors import ErrorsAs, TwinError
 from twin.signals import signals_as_ctrl_c
@@ -88,10 +88,8 @@ class Faults:
         """
         name, _, value = text.partition("=")
         if name not in self.known:
-            close = get_close_matches(name, self.known, n=1)
-            raise TwinError(
-                f"no fault '{quote(name)}'{f' (did you mean {close[0]}?)' if close else ''}; there are: {', '.join(self.known)}"
-            )
+            meant = "".join(f" (did you mean {close}?)" for close in get_close_matches(name, self.known, n=1))
+            raise TwinError(f"no fault '{quote(name)}'{meant}; there are: {', '.join(self.known)}")
         fault = self.known[name]
         if fault.allowed is None and value:
             raise TwinError(f"fault '{quote(text)}': {name} is a switch and takes no value; give {name} alone")
@@ -229,11 +227,8 @@ class PortServer(socketserver.ThreadingTCPServer):
         super().__init__(address, socketserver.BaseRequestHandler, bind_and_activate=False)
         self.clients: set[socket.socket] = set()
         self._serve, self._deaf = serve, deaf
-        try:
+        with on_error(self.server_close):
             self.server_bind()
-        except OSError:
-            self.server_close()
-            raise
         if not deaf:
             self.server_activate()
             Thread(target=self.serve_forever, args=(CLOSED_S,), daemon=True, name="emulated port").start()

@@ -9,9 +9,10 @@ import time
 from pathlib import Path
 from threading import Event, Lock, Thread
 
-from hardware.arms.magician_wire import Message, take_message
+from hardware.arms.magician import Message, take_message
 from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, EmulatedArm, Fault, Range
 from hardware.emulators.magician_controller import EmulatedController
+from hardware.errors import on_error
 from twin.errors import ErrorsAs, TwinError
 
 LOG = logging.getLogger(__name__)
@@ -75,13 +76,12 @@ class MagicianEmulator(EmulatedArm):
         tty.setraw(self._ends[1])
         self.device = os.ttyname(self._ends[1])
         if self._link is not None:
-            try:
+            remedy = "remove it or give another `link`"
+            refused = ErrorsAs(OSError, lambda error: TwinError(f"{self._link}: can't make the link ({error.strerror}); {remedy}"))
+            with on_error(self.unplug), refused:
                 if self._link.is_symlink() and (not self._link.exists() or os.readlink(self._link) == self.device):
                     self._link.unlink()  # left by an emulator that was killed
                 self._link.symlink_to(self.device)
-            except OSError as error:
-                self.unplug()
-                raise TwinError(f"{self._link}: can't make the link ({error.strerror}); remove it or give another `link`") from error
         self._thread = Thread(target=self._serve, daemon=True, name="magician-emulator")
         self._thread.start()
         self.place = f"magician {self._link or self.device}"

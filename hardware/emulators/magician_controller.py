@@ -10,15 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from hardware.arms.kinematics import MAGICIAN, NO_INVERSE, OutOfReachError, Violation
-from hardware.arms.magician_wire import Id, Message, Ptp
-from hardware.arms.motion import MotionTrack, Speeds, check_line, circle
+from hardware.arms.magician import Id, Message, Ptp
+from hardware.arms.motion import MAGICIAN, NO_INVERSE, MotionTrack, OutOfReachError, Speeds, Violation, check_line, circle
 from hardware.emulators.faults import Faults
 
 LOG = logging.getLogger(__name__)
 # Largest number of commands in the queue.
 QUEUE_N = 32
-# Numbers of alarms (see ``hardware.arms.dobot_alarms``).
+# Numbers of alarms (see ``hardware.arms.motion``).
 NOT_UNDERSTOOD, ARC_PLACES, LOST_STEPS = 1, 20, 80
 START_JOINTS_DEG = (0.0, 45.0, 45.0, 0.0)
 # Speed of the joints while homing, in deg/s. Chosen for the emulator.

@@ -12,10 +12,11 @@ from threading import Event
 import numpy as np
 
 from hardware.arms import mg400_wire as wire
+from hardware.arms.arm import happens
 from hardware.emulators.faults import EVERY_NTH, SECONDS, SHARE, EmulatedArm, Fault, PortServer, Range
 from hardware.emulators.mg400_commands import Mg400Commands, Request, parse_firmware, take_request
 from hardware.emulators.mg400_controller import START_JOINTS_DEG, Mg400Controller, PlanarFrame, RefusedError, refuse_if
-from hardware.errors import cannot_listen
+from hardware.errors import cannot_listen, on_error
 from twin.errors import ErrorsAs, TwinError
 
 LOG = logging.getLogger(__name__)
@@ -122,11 +123,8 @@ class Mg400Emulator(EmulatedArm):
         deaf |= set(wire.FEEDBACK_PERIOD_S) if "no-feedback" in self.faults else {30004} if "no-fast-feedback" in self.faults else set()
         for port in PORTS:
             at = self.host, 0 if self._port_offset is None else port + self._port_offset
-            try:
+            with on_error(self.stop), ErrorsAs(OSError, partial(cannot_listen, "mg400", *at, option="`port_offset`")):
                 server = self._servers[port] = PortServer(at, partial(self._serve, port), deaf=port in deaf)
-            except OSError as error:
-                self.stop()
-                raise cannot_listen("mg400", *at, error, option="`port_offset`") from error
             self.ports[port] = server.server_address[1]
         self.place = " ".join(map(str, ("mg400", self.host, *self.ports.values())))
         self._started_s = time.monotonic()
@@ -208,10 +206,8 @@ class Mg400Emulator(EmulatedArm):
     def _execute(self, port: int, request: Request) -> str:
         refuse_if("no-tcp-mode" in self.faults)
         if "needs-motion-client" in self.faults or "motion-port-closed" in self.faults:
-            motion, until_s = self._servers[wire.MOTION_PORT], time.monotonic() + ACCEPTS_S
-            while not motion.clients and time.monotonic() < until_s:
-                time.sleep(POLL_S)
-            refuse_if(not motion.clients, wire.ErrorId.NO_SUCH_COMMAND)
+            there = happens(lambda: self._servers[wire.MOTION_PORT].clients, ACCEPTS_S)
+            refuse_if(not there, wire.ErrorId.NO_SUCH_COMMAND)
         commands = self._commands.dashboard if port == wire.DASHBOARD_PORT else self._commands.motion
         refuse_if(request.name not in commands, wire.ErrorId.NO_SUCH_COMMAND)
         with self.arm.lock:

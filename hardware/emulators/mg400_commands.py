@@ -11,6 +11,7 @@ import numpy as np
 
 from hardware.arms.mg400_wire import ErrorId
 from hardware.arms.motion import Speeds, circle
+from hardware.emulators.faults import Range
 from hardware.emulators.mg400_controller import Mg400Controller, Order, PlanarFrame, RefusedError, refuse_if
 from twin.errors import ErrorsAs
 
@@ -18,50 +19,24 @@ from twin.errors import ErrorsAs
 LONGEST_REQUEST = 4096
 # Largest coordinate, mm, and angle, deg. A larger one counts as this one: no arm gets there either, and sums and products stay finite.
 FARTHEST = 1e5
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """Type and range of a command's parameter. A number whose size is above ``most`` counts as that size."""
-
-    integer: bool = False
-    low: float = float("-inf")
-    high: float = float("inf")
-    most: float = float("inf")
-
-
 # A coordinate or an angle of any size.
-NUMBER = Parameter(most=FARTHEST)
-# A speed or an acceleration, percent.
-PERCENT = Parameter(integer=True, low=1, high=100)
-# Ratio of continuous-path blending, percent.
-RATIO = Parameter(integer=True, low=0, high=100)
-# Number of a user or tool frame.
-INDEX = Parameter(integer=True, low=0, high=9)
-# Mass at the tool, kg.
-LOAD_KG = Parameter(low=0.0, high=0.5)
-# Number of a digital output.
-OUTPUT = Parameter(integer=True, low=1, high=24)
-# Number of a digital input.
-INPUT = Parameter(integer=True, low=1, high=16)
-# Number of an input or output at the tool.
-TOOL_PORT = Parameter(integer=True, low=1, high=2)
-# Level of a digital output.
-BIT = Parameter(integer=True, low=0, high=1)
-# Number of whole circles.
-LAPS = Parameter(integer=True, low=1, high=999)
-# Distance of the load's centre from the flange's axis, mm.
-CENTRE_MM = Parameter(low=-500.0, high=500.0)
-# Time that the queue waits, ms.
-WAIT_MS = Parameter(integer=True, low=1, high=3_600_000)
+NUMBER = Range(-np.inf, np.inf)
+# A speed or an acceleration, and the ratio of continuous-path blending, percent.
+PERCENT, RATIO = Range(1, 100, whole=True), Range(0, 100, whole=True)
+# Numbers of a user or tool frame and of a joint.
+INDEX, JOINT = Range(0, 9, whole=True), Range(1, 4, whole=True)
+# Mass at the tool, kg, and distance of its centre from the flange's axis, mm.
+LOAD_KG, CENTRE_MM = Range(0.0, 0.5), Range(-500.0, 500.0)
+# Numbers of a digital output, of a digital input, and of those at the tool; and a level.
+OUTPUT, INPUT, TOOL_PORT, BIT = (Range(low, high, whole=True) for low, high in ((1, 24), (1, 16), (1, 2), (0, 1)))
+# Number of whole circles, and time that the queue waits, ms.
+LAPS, WAIT_MS = Range(1, 999, whole=True), Range(1, 3_600_000, whole=True)
 # A collision level, and a part of an arm's orientation.
-LEVEL, SIDE = Parameter(integer=True, low=0, high=5), Parameter(integer=True, low=-1, high=1)
+LEVEL, SIDE = Range(0, 5, whole=True), Range(-1, 1, whole=True)
 # A place with R, and the numbers of a user and a tool frame.
 PLACE, PLACE_IN_FRAMES = (NUMBER,) * 4, (NUMBER,) * 4 + (INDEX,) * 2
-# Number of a joint.
-JOINT = Parameter(integer=True, low=1, high=4)
 # Numbers of Modbus slaves, of their registers, and of the values in one request. Slave 0 is the controller itself.
-SLAVE, ADDRESS, VALUES = (Parameter(integer=True, low=low, high=high) for low, high in ((0, 4), (0, 65535), (1, 16)))
+SLAVE, ADDRESS, VALUES = (Range(low, high, whole=True) for low, high in ((0, 4), (0, 65535), (1, 16)))
 # Registers that a value of a type takes.
 REGISTERS = {"U32": 2, "F32": 2, "F64": 4}
 # Names of the directions of a jog.
@@ -82,7 +57,7 @@ class Request:
     keywords: dict
     text: str
 
-    def whole(self, n: int, parameter: Parameter) -> int:
+    def whole(self, n: int, parameter: Range) -> int:
         """The whole number at a position of the values, from 0; raises as ``read_numbers``."""
         return int(_number(self.values[n], parameter, n + 1))
 
@@ -127,7 +102,7 @@ def _parse(text: str) -> Request:
     return Request(name.strip().lower(), tuple(values), keywords, text)
 
 
-def read_numbers(request: Request, parameters: tuple[Parameter, ...], counts: tuple[int, ...]) -> list[float]:
+def read_numbers(request: Request, parameters: tuple[Range, ...], counts: tuple[int, ...]) -> list[float]:
     """The request's values as numbers.
 
     Raises
@@ -153,27 +128,26 @@ def read_table(text: str, counts: tuple[int, ...], n: int, most: float = FARTHES
     return [max(-most, min(number, most)) for number in numbers]
 
 
-def keyword_number(request: Request, key: str, parameter: Parameter, default: float) -> float:
+def keyword_number(request: Request, key: str, parameter: Range, default: float) -> float:
     """The value of a keyword, or the default. In error ids, keywords are numbered after the values."""
     if key not in request.keywords:
         return default
     return _number(request.keywords[key], parameter, len(request.values) + 1 + list(request.keywords).index(key))
 
 
-def _number(text: str, parameter: Parameter, n: int) -> float:
+def _number(text: str, parameter: Range, n: int) -> float:
     with ErrorsAs(ValueError, lambda error: RefusedError(ErrorId.PARAMETER_TYPE - n)):
-        number = int(text) if parameter.integer else float(text)
-    refuse_if(
-        not (parameter.low <= number <= parameter.high and math.isfinite(number)), ErrorId.PARAMETER_RANGE - n
-    )  # a whole number may be too large for isfinite
-    return max(-parameter.most, min(number, parameter.most))
+        number = int(text) if parameter.whole else float(text)
+    # the range comes first, because a whole number may be too large for isfinite
+    refuse_if(number not in parameter or not math.isfinite(number), ErrorId.PARAMETER_RANGE - n)
+    return max(-FARTHEST, min(number, FARTHEST)) if parameter is NUMBER else number
 
 
 Command = Callable[[Request], str | None]
 """A command, which returns the values of its reply; None if it has none."""
 
 
-def command_of(act: Callable[..., str | None], *parameters: Parameter, counts: tuple[int, ...] = ()) -> Command:
+def command_of(act: Callable[..., str | None], *parameters: Range, counts: tuple[int, ...] = ()) -> Command:
     """A command that is a function of the numbers in its request, of which there are as many as parameters, or one of ``counts``."""
     return lambda request: act(*read_numbers(request, parameters, counts or (len(parameters),)))
 
@@ -339,9 +313,8 @@ class Mg400Commands:
         return _text(self._frame("user", user).inverse() @ flange @ self._frame("tool", tool))
 
     def _inverse(self, request: Request) -> str:
-        refuse_if(
-            len(request.values) not in (6, 7, 8), ErrorId.PARAMETER_COUNT
-        )  # two optional parameters select the solution near given joints; here there is only one
+        # two optional parameters select the solution near given joints; here there is only one
+        refuse_if(len(request.values) not in (6, 7, 8), ErrorId.PARAMETER_COUNT)
         *pose, user, tool = read_numbers(replace(request, values=request.values[:6]), PLACE_IN_FRAMES, (6,))
         joints = self.arm.joints_at(self._frame("user", user) @ PlanarFrame(*pose) @ self._frame("tool", tool).inverse())
         refuse_if(self.arm.kinematics.violation(joints))
@@ -362,10 +335,8 @@ class Mg400Commands:
         """Share of the path at which an output is set, its index and its level."""
         mode, distance, index, level = read_table(text, (4,), n)
         share = distance / 100.0 if mode == 0 else distance / max(length_mm, 1e-9)
-        refuse_if(
-            mode not in (0, 1) or not -1.0 <= share <= 1.0 or not OUTPUT.low <= index <= OUTPUT.high or level not in (0, 1),
-            ErrorId.PARAMETER_RANGE - n,
-        )
+        within = mode in (0, 1) and -1.0 <= share <= 1.0 and OUTPUT.low <= index <= OUTPUT.high and level in (0, 1)
+        refuse_if(not within, ErrorId.PARAMETER_RANGE - n)
         return share if share >= 0 else 1.0 + share, int(index), int(level)
 
     def _arc(self, request: Request) -> None:

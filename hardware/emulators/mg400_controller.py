@@ -8,15 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hardware.arms.kinematics import MG400, OutOfReachError, Violation
 from hardware.arms.mg400_wire import MAX_JOINT_DEG_S, MAX_LINEAR_MM_S, ErrorId, Mode
-from hardware.arms.motion import MotionTrack, Piece, Speeds, check_line
+from hardware.arms.motion import MG400, MotionTrack, OutOfReachError, Piece, Speeds, Violation, check_line
 from hardware.emulators.faults import Faults
 from twin.errors import ErrorsAs
 
 # Largest accelerations. They are chosen for the emulator, because those of a real arm are not known.
 MAX_LINEAR_MM_S2, MAX_JOINT_DEG_S2 = 4000.0, 3000.0
-# Numbers of alarms (see ``hardware.arms.dobot_alarms``).
+# Numbers of alarms (see ``hardware.arms.motion``).
 EMERGENCY_STOP, COLLISIONS = 85, (112, -2)
 # Joints at the start, far from all limits.
 START_JOINTS_DEG = (0.0, 20.0, 40.0, 0.0)
@@ -141,17 +140,10 @@ class Mg400Controller:
     def mode(self) -> Mode:
         now_s = self.update()
         with self.lock:
-            if self.alarms:
-                return Mode.ERROR
-            if not self.enabled:
-                return Mode.DISABLED
-            if self.dragged:
-                return Mode.BACKDRIVE
-            if self.paused:
-                return Mode.PAUSE
-            if self.track.moving(now_s):
-                return Mode.JOG if self._orders[-1].jog else Mode.RUNNING
-            return Mode.ENABLED
+            moving = self.track.moving(now_s)
+            holds = {Mode.ERROR: self.alarms, Mode.DISABLED: not self.enabled, Mode.BACKDRIVE: self.dragged, Mode.PAUSE: self.paused}
+            holds |= {Mode.JOG: moving and self._orders[-1].jog, Mode.RUNNING: moving}
+            return next((mode for mode, held in holds.items() if held), Mode.ENABLED)
 
     def busy(self) -> bool:
         """Whether commands are still in progress or queued (``Sync`` waits for them)."""

@@ -13,19 +13,18 @@ import struct
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
 from threading import Event, Lock, Thread
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from hardware.arms.kinematics import Violation
-from hardware.arms.motion import MotionTrack, Speeds
-from hardware.arms.ur.driver import DASHBOARD_PORT, EMERGENCY, IDLE, NORMAL, PAUSED, PLAYING, POWER_OFF, PROTECTIVE, RUNNING, STOPPED
-from hardware.arms.ur.kinematics import UrKinematics, pose_from_ur, pose_to_ur
+from hardware.arms.motion import MotionTrack, Speeds, Violation
+from hardware.arms.ur import driver as ur
 from hardware.emulators.faults import SECONDS, SHARE, EmulatedArm, Fault, Faults, PortServer
-from hardware.errors import cannot_listen
+from hardware.errors import cannot_listen, on_error
+from twin.errors import ErrorsAs
+from twin.rig.arm_pose import matrix_of
 
 LOG = logging.getLogger(__name__)
 SCRIPT_PORT, RTDE_PORT = 30003, 30004
@@ -78,14 +77,13 @@ class UrController:
 
     def __init__(self, faults: Faults, time_scale: float) -> None:
         self.faults, self._scale, self.lock = faults, time_scale, Lock()
-        self.kinematics = UrKinematics()
+        self.kinematics = ur.UrKinematics()
         self.kinematics.near_deg[:] = START_JOINTS_DEG
-        T = self.kinematics.T_flange_tool
-        T[:3, :3], T[:3, 3] = Rotation.from_rotvec(TOOL[3:]).as_matrix(), 1000.0 * np.array(TOOL[:3])
+        self.kinematics.T_flange_tool[:] = matrix_of(ur.pose_from_ur(np.array(TOOL)))
         self.track = MotionTrack(self.kinematics, np.array(START_JOINTS_DEG))
         self.inputs: dict[str, float] = defaultdict(float)
         self.outputs: dict[str, float] = defaultdict(float)
-        self.robot_mode, self.safety_mode, self.runtime_state = RUNNING, NORMAL, STOPPED
+        self.robot_mode, self.safety_mode, self.runtime_state = ur.RUNNING, ur.NORMAL, ur.STOPPED
         self._started_s = self._cycled_s = self.written_s = time.monotonic()
         self._program: Iterator[None] | None = None
         self._starts_s = 0.0  # when the script starts
@@ -95,7 +93,7 @@ class UrController:
     @property
     def enabled(self) -> bool:
         """Whether the control script runs under its watchdog."""
-        return self.runtime_state == PLAYING and self.watchdog_hz > 0
+        return self.runtime_state == ur.PLAYING and self.watchdog_hz > 0
 
     def busy(self) -> bool:
         """Whether the arm moves."""
@@ -112,63 +110,63 @@ class UrController:
             if now_s >= self._collides_s:
                 self._collides_s = np.inf
                 self.protective_stop()
-            if self.runtime_state == PLAYING and self._program is not None:
+            if self.runtime_state == ur.PLAYING and self._program is not None:
                 starves = self.enabled and now_s - self.written_s > 1 / self.watchdog_hz
                 ends_s = self.faults.value("script-ends")
                 if starves or (ends_s is not None and now_s > self._starts_s + ends_s) or next(self._program, self) is self:
                     self.end_program()
-            elif self.runtime_state == STOPPED and self._program is not None and now_s >= self._starts_s:
-                self.runtime_state = PLAYING
+            elif self.runtime_state == ur.STOPPED and self._program is not None and now_s >= self._starts_s:
+                self.runtime_state = ur.PLAYING
             pose = self.track.pose(now_s)
             joints = self.kinematics.inverse(pose) if self.track.target().linear else self.track.joints_deg(now_s)
             speed = np.radians(joints - self.kinematics.near_deg) / max(now_s - self._cycled_s, CYCLE_S / 2)
             self.kinematics.near_deg[:], self._cycled_s = joints, now_s
             values: dict[str, Any] = dict.fromkeys(("actual_q", "target_q"), np.radians(joints))
             values |= dict.fromkeys(("actual_qd", "target_qd"), speed)
-            values |= dict.fromkeys(("actual_TCP_pose", "target_TCP_pose"), pose_to_ur(pose))
+            values |= dict.fromkeys(("actual_TCP_pose", "target_TCP_pose"), ur.pose_to_ur(pose))
             values |= dict.fromkeys(("speed_scaling", "target_speed_fraction"), self.faults.factor("slider"))
             values |= {name: getattr(self, name) for name in ("robot_mode", "safety_mode", "runtime_state")}
-            values["safety_status_bits"] = {NORMAL: 1, PROTECTIVE: 4, EMERGENCY: 128}[self.safety_mode]
+            values["safety_status_bits"] = {ur.NORMAL: 1, ur.PROTECTIVE: 4, ur.EMERGENCY: 128}[self.safety_mode]
             return values | self.outputs | {"timestamp": now_s - self._started_s}
 
     def run_script(self, name: str) -> None:
         """Run an uploaded script. Only the control script of ``ur_rtde`` is known."""
         with self.lock:
             self.end_program()
-            if name == "rtde_control" and self.robot_mode == RUNNING and self.safety_mode == NORMAL:
+            if name == "rtde_control" and self.robot_mode == ur.RUNNING and self.safety_mode == ur.NORMAL:
                 self._program, self._starts_s = self._control(), time.monotonic() + (self.faults.value("late-start") or 0.0)
 
     def end_program(self) -> None:
         """End the script; the arm stops."""
         self.track.stop(time.monotonic())
-        self.runtime_state, self._program, self.watchdog_hz = STOPPED, None, 0.0
+        self.runtime_state, self._program, self.watchdog_hz = ur.STOPPED, None, 0.0
 
     def press_emergency_stop(self) -> None:
         """Press the emergency stop, which cuts the power."""
-        self.power(POWER_OFF)
-        self.safety_mode = EMERGENCY
+        self.power(ur.POWER_OFF)
+        self.safety_mode = ur.EMERGENCY
 
     def power(self, mode: int) -> None:
         """Bring the motors into a mode: without power, with brakes, or running."""
         self.end_program()
-        self.robot_mode = mode if self.safety_mode == NORMAL else POWER_OFF
+        self.robot_mode = mode if self.safety_mode == ur.NORMAL else ur.POWER_OFF
 
     def protective_stop(self) -> None:
         """Stop as after a collision. The script pauses."""
         self.track.stop(time.monotonic())
-        self.runtime_state = PAUSED if self._program is not None else STOPPED
-        self.safety_mode, self._locked_until_s = PROTECTIVE, time.monotonic() + LOCKED_S / self._scale
+        self.runtime_state = ur.PAUSED if self._program is not None else ur.STOPPED
+        self.safety_mode, self._locked_until_s = ur.PROTECTIVE, time.monotonic() + LOCKED_S / self._scale
 
     def answer(self, request: str) -> str:
         """The dashboard's answer to a request."""
         words = {"polyscopeversion": "3.15.8.106339", "get robot model": "UR5", "close safety popup": "closing safety popup"}
-        words["running"] = f"Program running: {str(self.runtime_state == PLAYING).lower()}"
+        words["running"] = f"Program running: {str(self.runtime_state == ur.PLAYING).lower()}"
         acts = {
             "stop": (self.end_program, "Stopped"),
-            "power on": (lambda: self.power(max(self.robot_mode, IDLE)), "Powering on"),
-            "brake release": (lambda: self.power(RUNNING), "Brake releasing"),
-            "power off": (lambda: self.power(POWER_OFF), "Powering off"),
-            "unlock protective stop": (lambda: setattr(self, "safety_mode", NORMAL), "Protective stop releasing"),
+            "power on": (lambda: self.power(max(self.robot_mode, ur.IDLE)), "Powering on"),
+            "brake release": (lambda: self.power(ur.RUNNING), "Brake releasing"),
+            "power off": (lambda: self.power(ur.POWER_OFF), "Powering off"),
+            "unlock protective stop": (lambda: setattr(self, "safety_mode", ur.NORMAL), "Protective stop releasing"),
         }
         if request not in acts:
             return words.get(request, f"could not understand: '{request}'")
@@ -203,7 +201,7 @@ class UrController:
         self.track.stop(now_s)  # a move replaces the one before it
         if "ignore-moves" in self.faults:
             return
-        end = pose_from_ur(np.array(target)) if linear else np.degrees(target)
+        end = ur.pose_from_ur(np.array(target)) if linear else np.degrees(target)
         speeds = Speeds(1000.0 * speed, float(np.degrees(speed)), 1000.0 * acceleration, float(np.degrees(acceleration)))
         piece = self.track.move(end, speeds.scale_time(self._scale * self.faults.factor("slider")), linear=linear, now_s=now_s)
         if isinstance(piece, Violation):
@@ -270,12 +268,9 @@ class UrEmulator(EmulatedArm):
         DeviceError
             A port is taken, or the host is not this machine's.
         """
-        for port, serve in ((DASHBOARD_PORT, self._serve_dashboard), (SCRIPT_PORT, self._serve_scripts), (RTDE_PORT, self._serve_rtde)):
-            try:
+        for port, serve in ((ur.DASHBOARD_PORT, self._serve_dashboard), (SCRIPT_PORT, self._serve_scripts), (RTDE_PORT, self._serve_rtde)):
+            with on_error(self.unplug), ErrorsAs(OSError, partial(cannot_listen, "ur", self.host, port, option="`host`")):
                 self._ports.append(PortServer((self.host, port), serve))
-            except OSError as error:
-                self.unplug()
-                raise cannot_listen("ur", self.host, port, error, option="`host`") from error
 
     def unplug(self) -> None:
         """Lose every connection. The arm goes on."""

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from serial.tools import list_ports
 
-from hardware.cameras.ros2 import PICTURES
-from hardware.cameras.uvc import SYSFS_CAMERAS, port_of
+from hardware.cameras.source import PICTURES, SYSFS_CAMERAS, port_of
 from hardware.errors import DeviceError
 from hardware.ros2.dds import Participant
 from scenes import list_specifications
@@ -169,8 +168,7 @@ def _rendering() -> tuple[list[str], bool]:
     except RenderError as error:
         return [f"NOT POSSIBLE: {error}"], False
     lines = [f"variants installed: {', '.join(found['variants'])}"]
-    for channels, used in found["used"].items():
-        lines.append(f"for {channels} cameras: {used['variant'] or 'NONE'} ({used['reason']})")
+    lines += [f"for {channels} cameras: {used['variant'] or 'NONE'} ({used['reason']})" for channels, used in found["used"].items()]
     llvm = found["llvm"]
     lines.append(f"LLVM: {llvm['version']} at {llvm['path']}" if llvm else f"LLVM: none that works; {found['remedy']}")
     lines += [f"  not used: {rejected['path']}: {rejected['reason']}" for rejected in found["llvm_rejected"]]

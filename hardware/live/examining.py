@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from hardware.cameras.choose import open_camera
-from hardware.cameras.source import await_frame
+from hardware.cameras.source import await_frame, open_camera
 from scenes import SensorSpec
 from twin.calibration.camera_view import register_files
 from twin.errors import FrameError, OptionError, format_count

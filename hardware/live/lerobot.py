@@ -7,12 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from hardware.arms.arm import Arm
-from hardware.arms.newest import NewestTarget
+from hardware.arms.arm import Arm, NewestTarget
 from hardware.arms.open_arm import kind_of, open_arm
-from hardware.cameras.choose import open_camera
-from hardware.cameras.source import FrameSource
-from hardware.errors import Connection, DeviceError, StaleDataError, leave
+from hardware.cameras.source import FrameSource, open_camera
+from hardware.errors import Connection, DeviceError, StaleDataError, on_error
 from hardware.live.doctor import cameras
 from hardware.safety.decide import load_limits
 from hardware.safety.safe_arm import SafeArm
@@ -199,14 +197,11 @@ class LeRobotArm(Connection):
     def connect(self, calibrate: bool = True) -> None:
         """Connect and enable the arm, and connect the cameras. ``calibrate`` has no effect."""
         self.arm.connect()
-        try:
+        with on_error(self.disconnect):
             self.arm.enable()
             self.configure()
             for camera in self.cameras.values():
                 camera.connect()
-        except BaseException as error:
-            leave(self.disconnect, error)
-            raise
         self._newest.start()
 
     def get_observation(self) -> dict[str, Any]:

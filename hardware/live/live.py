@@ -9,7 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from socket import create_connection
@@ -17,9 +17,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from hardware.cameras.choose import open_camera
-from hardware.cameras.recorded import SessionSource
-from hardware.cameras.source import FrameSource, await_frame
+from hardware.cameras.source import FrameSource, SessionSource, await_frame, open_camera
 from hardware.errors import DeviceError
 from hardware.servo.timing import TimeSpread, Timing
 from hardware.workcell.build import load_rest_frame
@@ -85,8 +83,9 @@ class RerunView:
         DeviceError
             No viewer answers at the address, or the file can't be written.
         """
-        stream = self._stream
-        try:
+        stream, told = self._stream, f"`rerun` {self._target}: can't be opened"
+        remedy = f"start a viewer ('rerun' prints its address) and give rerun+http://HOST:9876/proxy, or a file *{SUFFIX}"
+        with ErrorsAs((RuntimeError, OSError, ValueError), lambda error: DeviceError(f"{told} ({error}); {remedy}")):
             if self._target == VIEWER:
                 stream.spawn()
             elif "://" in self._target:
@@ -96,9 +95,6 @@ class RerunView:
                 Path(self._target).parent.mkdir(parents=True, exist_ok=True)
                 stream.save(self._target)
             stream.flush(timeout_sec=ANSWER_S)  # connecting itself reports no error, but flushing does
-        except (RuntimeError, OSError, ValueError) as error:
-            remedy = "start a viewer ('rerun' prints its address) and give rerun+http://HOST:9876/proxy, or a file"
-            raise DeviceError(f"`rerun` {self._target}: can't be opened ({error}); {remedy} *{SUFFIX}") from error
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -158,10 +154,8 @@ class LiveSession:
     count: int = 0
     valid: int = 0
     invalid: str = ""
-    _ages: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
-    _late: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
-    _spent: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
-    _done: deque[float] = field(default_factory=lambda: deque(maxlen=RATE_SPAN))
+    # ages of the frames when they were taken and when their estimates were made (NaN for a recording), times spent, and ends
+    _times: deque[tuple[float, float, float, float]] = field(default_factory=lambda: deque(maxlen=KEPT_TIMES))
     _begun_s: float = field(default_factory=time.monotonic)
 
     def run(
@@ -191,12 +185,8 @@ class LiveSession:
             taken_s = time.monotonic()
             with ErrorsAs(FrameError, lambda error: FrameError(f"{self.source.name}: {error}")):
                 estimate = self.estimator(frame)
-            now_s = time.monotonic()
-            if self.source.is_live:
-                self._ages.append(taken_s - frame.time_s)
-                self._late.append(now_s - frame.time_s)
-            self._spent.append(now_s - taken_s)
-            self._done.append(now_s)
+            now_s, exposed_s = time.monotonic(), frame.time_s if self.source.is_live else np.nan
+            self._times.append((taken_s - exposed_s, now_s - exposed_s, now_s - taken_s, now_s))
             self.count += 1
             self.valid += estimate.valid
             self.invalid = self.invalid if estimate.valid else estimate.reason
@@ -210,7 +200,7 @@ class LiveSession:
     def timing(self) -> Timing:
         """The figures so far."""
         rate_hz = self.count / max(time.monotonic() - self._begun_s, 1e-9)
-        late, ages, spent = (TimeSpread.of(list(times)) for times in (self._late, self._ages, self._spent))
+        ages, late, spent, _ = map(TimeSpread.of, np.reshape(self._times, (-1, 4)).T.tolist())
         return Timing(self.count, rate_hz, rate_hz, late, ages, spent, self.source.dropped)
 
     def lines(self, estimate: Estimate) -> list[str]:
@@ -220,9 +210,10 @@ class LiveSession:
             pose = [f"{name} {value:+.2f} [{low:+.2f}, {high:+.2f}]" for name, value, low, high in rows]
         else:
             pose = [f"not valid: {estimate.reason}"]
-        done = list(self._done)
+        times = list(self._times)
+        done = [end_s for *_, end_s in times[-RATE_SPAN:]]
         now_hz = (len(done) - 1) / (done[-1] - done[0]) if len(done) > 1 and done[-1] > done[0] else 0.0
-        late = f", exposure to pose {1e3 * float(np.median(self._late)):.0f} ms" if self._late else ""
+        late = f", exposure to pose {1e3 * np.median([late_s for _, late_s, *_ in times]):.0f} ms" if times and self.source.is_live else ""
         return ["   ".join(pose), f"{now_hz:.1f} frames/s, {format_count(self.count, 'frames')}, {self.source.dropped} dropped{late}"]
 
 
@@ -454,11 +445,10 @@ def watch(
             session.record = stack.enter_context(SessionWriter(plan.record, about))
             if rest is not None:
                 session.record.keep_rest(rest)
-        interrupted = False
-        try:
+        interrupted = True
+        with suppress(KeyboardInterrupt):
             session.run(most=plan.count, seconds=plan.seconds, rate_hz=plan.rate or np.inf, going=lambda: shower is None or shower.open)
-        except KeyboardInterrupt:
-            interrupted = True
+            interrupted = False
         same = (same_estimates(source.session.steps, found), len(found)) if isinstance(source, SessionSource) else None
         return WatchResult(session.timing(), interrupted, same, plan.record, session.count, source.notes(), session.valid, session.invalid)
 

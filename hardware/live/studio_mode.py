@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from hardware.arms.open_arm import kind_of, open_arm
-from hardware.cameras.choose import open_camera
-from hardware.cameras.source import FrameSource
-from hardware.errors import DeviceError
+from hardware.cameras.source import FrameSource, open_camera
+from hardware.errors import DeviceError, on_error
 from hardware.live.live import LiveSession, estimate_line
 from hardware.safety.decide import load_limits
 from hardware.safety.eyes import FreshFrames
@@ -219,11 +218,8 @@ class CameraFeed:
         """
         if self.robot is not None:
             self.robot.connect()
-        try:
+        with on_error(self._close_arm):
             self._source.connect()
-        except BaseException:
-            self._close_arm()
-            raise
 
         def deliver(frame: Frame, estimate: Estimate) -> None:
             with self._writing:

@@ -10,10 +10,9 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
-from hardware.arms.kinematics import Kinematics, LinkageKinematics
+from hardware.arms.motion import Kinematics, LinkageKinematics
 from hardware.errors import DeviceError
-from scenes.object import ObjectSpec
-from scenes.servo import PlacementSpec
+from scenes import ObjectSpec, PlacementSpec
 from twin.rig.arm_pose import matrix_of, pose_of
 from twin.rig.kinematics import Mounting
 from twin.rig.touch import SmoothSurface, TrueTouch
@@ -62,10 +61,8 @@ class PlacedObject:
 
     def __init__(self, spec: ObjectSpec, placement: PlacementSpec, mounting: Mounting) -> None:
         self.spec, self.mounting = spec, mounting
-        c, s = np.cos(np.radians(placement.turn_deg)), np.sin(np.radians(placement.turn_deg))
-        self.T_base_object = np.eye(4)
-        self.T_base_object[:3, :3] = np.column_stack([[c, s, 0], [0, 0, -1], [-s, c, 0]])
-        self.T_base_object[:3, 3] = placement.position_mm
+        turned = matrix_of(np.array([*placement.position_mm, 0.0, 0.0, placement.turn_deg]))
+        self.T_base_object = turned[:, [0, 2, 1, 3]] * [1, -1, 1, 1]  # its z lies along the turned y, and its y points down
         self._T_tool_sensor = mounting.T_tool_sensor
         self._surface = SmoothSurface(spec)
 
@@ -119,7 +116,6 @@ def path_around(placed: PlacedObject, start: np.ndarray, clear: np.ndarray) -> l
     surface = outline @ placed.T_base_object[:2, [0, 2]].T + placed.T_base_object[:2, 3]
     middle = (surface.min(axis=0) + surface.max(axis=0)) / 2
     radius_mm = np.linalg.norm(surface - middle, axis=1).max() + placed.mounting.skin_reach_mm + MARGIN_MM
-    T = matrix_of(clear)
     domes = [matrix_of(pose)[:2, :3] @ placed.mounting.centre_mm + pose[:2] - middle for pose in (start, clear)]
     if distance_to_axis(*domes) >= min(radius_mm, np.linalg.norm(domes[1])):
         return [clear]
@@ -133,7 +129,7 @@ def path_around(placed: PlacedObject, start: np.ndarray, clear: np.ndarray) -> l
         last[:2] += inside_mm * np.array([np.cos(angle), np.sin(angle)])
         way.append(last)
     for at in np.linspace(turn, 0.0, int(np.ceil(abs(np.degrees(turn)) / STEP_DEG)) + 1):
-        spun = _spun(T, at, middle)
+        spun = _spun(matrix_of(clear), at, middle)
         spun[:2, 3] += outward_mm * np.array([np.cos(end + at), np.sin(end + at)])
         last = pose_of(spun, last)
         way.append(last)
@@ -148,20 +144,16 @@ def _require_in_front(placed: PlacedObject, start: np.ndarray, clear: np.ndarray
     samples = max(2, int(np.ceil(np.linalg.norm(ends[1] - ends[0]) / SAMPLE_MM)))
     gap_mm = min(placed.distance_mm(ends[0] + share * (ends[1] - ends[0])) for share in np.linspace(0.0, 1.0, samples))
     if gap_mm < 0.0:
-        raise DeviceError(
-            f"the straight path to the {placed.spec.name} leads {-gap_mm:.0f} mm behind its surface, whose extent is not known; jog the "
-            "arm to the side from which the sensor is to touch it, or correct the object's place ('placement' in the file for `servo`)"
-        )
+        way = f"the straight path to the {placed.spec.name} leads {-gap_mm:.0f} mm behind its surface, whose extent is not known"
+        place = "correct the object's place ('placement' in the file for `servo`)"
+        raise DeviceError(f"{way}; jog the arm to the side from which the sensor is to touch it, or {place}")
 
 
 def _spun(T: np.ndarray, angle: float, middle: np.ndarray) -> np.ndarray:
     """A pose (4, 4) turned about the vertical through ``middle`` (2,)."""
-    c, s = np.cos(angle), np.sin(angle)
-    turn = np.array([[c, -s], [s, c]])
-    out = T.copy()
-    out[:2, :3] = turn @ T[:2, :3]
-    out[:2, 3] = middle + turn @ (T[:2, 3] - middle)
-    return out
+    turn = matrix_of(np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.degrees(angle)]))
+    turn[:2, 3] = middle - turn[:2, :2] @ middle
+    return turn @ T
 
 
 @dataclass(frozen=True)
@@ -213,8 +205,7 @@ def poses_along(placed: PlacedObject, indent_mm: float, length_mm: float) -> Ite
     for (x, z), angle, distance in zip(outline, angles - angles[0], along, strict=True):
         if distance > length_mm:
             return
-        c, s = np.cos(angle), np.sin(angle)
-        T = np.array([[c, 0, -s, x], [0, 1, 0, 0], [s, 0, c, z], [0, 0, 0, 1.0]])
+        T = matrix_of(np.array([x, 0.0, z, 0.0, -np.degrees(angle), 0.0]))
         yield float(distance), pose_of(placed.T_base_object @ T @ np.linalg.inv(placed.T_base_object) @ first, np.zeros(6))
 
 

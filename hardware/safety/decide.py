@@ -12,8 +12,7 @@ import numpy as np
 from pydantic import AfterValidator
 
 from hardware.arms.arm import FEEDBACK_AGE_S, ArmState
-from hardware.arms.kinematics import LINKAGE_ABOVE, LINKAGE_BELOW, Kinematics, OutOfReachError, finite_numbers
-from hardware.arms.motion import check_line, turn_between_deg
+from hardware.arms.motion import LINKAGE_ABOVE, LINKAGE_BELOW, Kinematics, OutOfReachError, check_line, finite_numbers, turn_between_deg
 from hardware.errors import DeviceError
 from hardware.rig.geometry import distance_to_axis
 from scenes.base import Fraction, NonNegative, Positive, Section, SpecError

@@ -22,7 +22,7 @@ import numpy as np
 from hardware.arms.arm import Arm, ArmState
 from hardware.arms.awake import awake_s
 from hardware.cameras.source import FrameSource
-from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
+from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError, on_error
 from twin.types import Frame
 
 LOG = logging.getLogger(__name__)
@@ -102,14 +102,9 @@ class ArmWatch:
         """Context in which the thread runs."""
         return work_in_thread(self._watch, "arm watch")
 
-    @contextmanager
-    def alert(self) -> Iterator[None]:
+    def alert(self) -> AbstractContextManager[None]:
         """Context of the work with the arm. After an error the arm's state is read once more, so that a lost arm is reported first."""
-        try:
-            yield
-        except BaseException:
-            self._look()
-            raise
+        return on_error(self._look)
 
     @contextmanager
     def doing(self, what: str) -> Iterator[None]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from hardware.arms.arm import FEEDBACK_AGE_S, Arm, ArmState
-from hardware.arms.kinematics import Kinematics
+from hardware.arms.motion import Kinematics
 from hardware.errors import Connection, DeviceError, StaleDataError, also
 from hardware.rig.geometry import LastAxis
 from hardware.safety.decide import Action, Decision, DecisionCode, SafetyLimits, Sensed, clip, decide, decide_joints

@@ -19,7 +19,7 @@ from hardware.rig.geometry import LastAxis, PlacedObject, poses_along, shift_in_
 from hardware.servo.loop import LoopHooks, LoopSettings, ServoLoop, StepRecord, require_labels
 from hardware.servo.timing import Timing
 from hardware.servo.trajectory import Measures, Trajectory, comparison_figure, measure, trajectory_figure, trajectory_of, write_csv
-from hardware.workcell.build import TWIN, DryRunDone, Rig, build_rig, check_plan, load_rest_frame
+from hardware.workcell.build import TWIN, DryRunDone, Rig, RigPlan, build_rig, check_plan, load_rest_frame
 from scenes import ObjectSpec, ServoSpec, load_experiment
 from scenes.files import quote
 from twin.errors import OptionError, StoreError, TwinError, format_count
@@ -66,15 +66,12 @@ MOST_STEPS = 1_000_000
 
 def policy_law(policy: Policy, mounting: Mounting) -> Callable[[np.ndarray, Estimate], np.ndarray]:
     """Function from the arm's pose (6,) and the policy's answer to a frame to the next pose (6,)."""
-    T_tool_work = np.eye(4)
-    T_tool_work[:3, :3] = mounting.work_axes
 
     def law(pose: np.ndarray, answer: Estimate) -> np.ndarray:
-        step = policy.step(np.asarray(answer.value, float))
-        move = np.eye(4)
-        move[:3, :3] = Rotation.from_rotvec(step[3:], degrees=True).as_matrix()
-        move[:3, 3] = step[:3]
-        return pose_of(matrix_of(pose) @ T_tool_work @ move @ T_tool_work.T, pose)
+        shift, turn = policy.step(np.asarray(answer.value, float)).reshape(2, 3) @ mounting.work_axes.T  # in the tool frame
+        T = matrix_of(shift_in_tool(pose, shift))
+        T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(turn, degrees=True).as_matrix()
+        return pose_of(T, pose)
 
     return law
 
@@ -93,31 +90,23 @@ def load_for_outlines(path: Path, contacts_of: Callable[[Policy], KnownContacts 
     return PolicyModel(policy, contacts=contacts_of(policy))
 
 
-@dataclass(frozen=True)
-class FollowPlan:
+@dataclass(frozen=True, kw_only=True)
+class FollowPlan(RigPlan):
     """Settings of a run, and its devices. The sensor and the form of its frames are those of the model.
 
     Attributes
     ----------
-    obj : ObjectSpec
-        The object.
-    servo : ServoSpec
-        Gains, speeds and the object's place.
     camera, arm : str
-        As for ``build_rig``. If no camera is given, the twin's frames are drawn. This is allowed for a simulated arm only, because a real
+        As in ``RigPlan``. If no camera is given, the twin's frames are drawn. This is allowed for a simulated arm only, because a real
         arm would follow a contact that does not exist.
     steps : int or None
         Number of steps; None: once around the object.
     stream_hz : float or None
         Decisions per second; None: each decision waits for the move before it.
-    limits : str or None
-        Safety limits, by name or file; None: those of the arm's kind.
     record : bool
         Keep every frame and step in a session.
     seed : int
         Seed of the twin's noise.
-    plain_light : bool
-        Draw the twin's frames without path tracing; see ``build_rig``.
     known_place : bool
         Whether the object really stands at the servo's placement, so that the results can be compared with the truth. This is always true
         in the twin.
@@ -126,27 +115,16 @@ class FollowPlan:
         from the contacts), or a file.
     also : tuple of str
         Further formats in which the session is kept at its end, each in a subfolder of it.
-    dry_run : bool
-        End after the check of the plan, before anything moves.
-    ros2 : str or None
-        Namespace in which frames, estimates and the arm's pose are published as ROS 2 topics.
     """
 
-    obj: ObjectSpec
-    servo: ServoSpec
     camera: str = ""
     arm: str = "simulated"
     steps: int | None = None
     stream_hz: float | None = None
-    limits: str | None = None
     record: bool = False
     seed: int = 0
-    plain_light: bool = False
     known_place: bool = False
     at_rest: str = FIRST
-    also: tuple[str, ...] = ()
-    dry_run: bool = False
-    ros2: str | None = None
 
     def __post_init__(self) -> None:
         if self.also and not self.record:
@@ -223,19 +201,8 @@ def follow(
         model = model.at_rest(rest)
     elif plan.at_rest != FIRST:
         model = model.seeking_rest()
-    rig = build_rig(
-        model.sensor,
-        plan.obj,
-        plan.servo.placement,
-        load_experiment(plan.servo.experiment),
-        camera=plan.camera,
-        arm=plan.arm,
-        form=model.form,
-        limits=plan.limits,
-        seed=plan.seed,
-        plain_light=plan.plain_light,
-        at_once=plan.stream_hz is None,
-    )
+    experiment, at_once = load_experiment(plan.servo.experiment), plan.stream_hz is None
+    rig = build_rig(plan, model.sensor, experiment, form=model.form, seed=plan.seed, at_once=at_once)
     round_steps, wanted_mm = steps_round(rig.placed, plan.servo, 1.0)
     steps = plan.steps or round_steps
     if plan.steps:

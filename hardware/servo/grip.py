@@ -20,12 +20,11 @@ from typing import Protocol, cast
 
 import numpy as np
 
-from hardware.arms.arm import POLL_S, Arm, ArmState
+from hardware.arms.arm import Arm, ArmState, happens
 from hardware.arms.mg400 import MG400
 from hardware.arms.open_arm import kind_of
 from hardware.arms.ros2 import CONNECT_S, topic_in
-from hardware.cameras.choose import open_camera
-from hardware.cameras.source import FrameSource, no_frame
+from hardware.cameras.source import FrameSource, no_frame, open_camera
 from hardware.cameras.twin import TwinCamera
 from hardware.errors import DeviceError
 from hardware.ros2.dds import Participant, Writer
@@ -105,13 +104,10 @@ class Ros2Gripper:
         self._writer: Writer | None = None
 
     def move(self, width_mm: float) -> None:
-        self._writer = self._writer or Participant().writer(self._topic, POSITIONS)
-        until_s = time.monotonic() + CONNECT_S
-        while not self._writer.heard:
-            if time.monotonic() > until_s:
-                raise DeviceError(f"{self.name}: nobody takes {POSITIONS} there; start its controller, or name its topic of commands")
-            time.sleep(POLL_S)
-        self._writer.write(ros.encode(POSITIONS, {"data": np.full(self._joints, width_mm / ros.MM_PER_M / self._joints)}), time.time_ns())
+        writer = self._writer = self._writer or Participant().writer(self._topic, POSITIONS)
+        if not happens(lambda: writer.heard, CONNECT_S):
+            raise DeviceError(f"{self.name}: nobody takes {POSITIONS} there; start its controller, or name its topic of commands")
+        writer.write(ros.encode(POSITIONS, {"data": np.full(self._joints, width_mm / ros.MM_PER_M / self._joints)}), time.time_ns())
         self.width_mm = width_mm
 
 

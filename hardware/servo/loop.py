@@ -2,6 +2,15 @@
 
 A frame is exposed while the arm moves. Therefore the loop keeps the newest states of the arm (``ArmWatch``), and takes the pose at the
 frame's exposure from them. The thread of ``ArmWatch`` also stops an arm that no longer answers.
+
+The servo law, ``servo_step``, is a pure function: from the surface in a frame and the arm's present pose to its next pose. An estimate of
+depth and angle, together with the arm's pose when the frame was exposed, puts the surface's tangent into the base frame. The law compares
+the present pose of the arm with that tangent, so a frame may be older than the last move. Depth d and angle w of the tool against the
+tangent, reference r, sums S of the errors (bounded),
+
+    e = r - (d, w),   S' = clip(S + e),   (d, w)' = (d, w) + kp e + ki S',   along' = along + feed
+
+(Lepora & Lloyd's pose-based tactile servoing; positions are commanded, so the arm itself is one integrator).
 """
 
 import logging
@@ -11,24 +20,112 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hardware.arms.arm import ArmState
 from hardware.cameras.source import no_frame
 from hardware.errors import DeviceError, StaleDataError
 from hardware.rig.geometry import HOLD_DEG
 from hardware.safety.decide import DecisionCode, Sensed
-from hardware.safety.eyes import NEAR_MM as PIECES_MM
-from hardware.safety.eyes import BlindError, pieces_to
+from hardware.safety.eyes import NEAR_MM, BlindError, pieces_to
 from hardware.safety.safe_arm import RefusedMoveError
-from hardware.servo.law import Memory, Reading, servo_step, tangent_of
 from hardware.servo.timing import TimeSpread, Timing
-from hardware.workcell.build import Rig
-from hardware.workcell.mover import MOVE_TIMEOUT_S, Mover
+from hardware.workcell.build import MOVE_TIMEOUT_S, Mover, Rig
 from scenes.servo import ServoSpec
 from twin.errors import ErrorsAs
 from twin.estimate import Estimate, Estimator
+from twin.rig.arm_pose import matrix_of, pose_of
 from twin.rig.kinematics import Mounting
 from twin.types import Frame
+
+
+@dataclass(frozen=True)
+class Memory:
+    """Sums of the errors of depth (mm) and angle (deg) over the steps."""
+
+    depth_mm: float = 0.0
+    angle_deg: float = 0.0
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Depth of the tool beyond first touch, and its angle from the surface's normal."""
+
+    depth_mm: float
+    angle_deg: float
+
+
+@dataclass(frozen=True)
+class LawStep:
+    """The result of one step of the law.
+
+    Attributes
+    ----------
+    pose : (6,) float
+        The arm's next pose.
+    memory : Memory
+    """
+
+    pose: np.ndarray
+    memory: Memory
+
+
+def tangent_of(mounting: Mounting, pose: np.ndarray, reading: Reading) -> np.ndarray:
+    """``T_base_surface`` (4, 4), the pose of a tool that just touches the surface and stands normal to it.
+
+    Parameters
+    ----------
+    mounting : Mounting
+    pose : (6,) float
+        The arm's pose when the frame was exposed.
+    reading : Reading
+    """
+    T = matrix_of(pose)
+    T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(-np.radians(reading.angle_deg) * mounting.out_of_plane).as_matrix()
+    T[:3, 3] -= reading.depth_mm * (T[:3, :3] @ mounting.axis)
+    return T
+
+
+def reading_at(mounting: Mounting, T_base_surface: np.ndarray, pose: np.ndarray) -> Reading:
+    """Depth and angle of a tool at a pose (6,) against a tangent (4, 4)."""
+    seen = np.linalg.inv(T_base_surface) @ matrix_of(pose)
+    turn = Rotation.from_matrix(seen[:3, :3]).as_rotvec(degrees=True)
+    return Reading(float(mounting.axis @ seen[:3, 3]), float(mounting.out_of_plane @ turn))
+
+
+def servo_step(
+    spec: ServoSpec, mounting: Mounting, T_base_surface: np.ndarray, pose: np.ndarray, memory: Memory, *, fresh: bool = True
+) -> LawStep:
+    """The arm's next pose.
+
+    Parameters
+    ----------
+    spec : ServoSpec
+    mounting : Mounting
+    T_base_surface : (4, 4) float
+        The surface's tangent from ``tangent_of``.
+    pose : (6,) float
+        The arm's present pose, or the last pose to which it was sent.
+    memory : Memory
+    fresh : bool
+        Whether the tangent comes from a new frame; an old frame does not change the sums.
+    """
+    axis, out_of_plane = mounting.axis, mounting.out_of_plane
+    now = reading_at(mounting, T_base_surface, pose)
+    error_mm, error_deg = spec.indent_mm - now.depth_mm, spec.angle_deg - now.angle_deg
+    if fresh:
+        bounds = np.array([spec.integral_mm, spec.integral_deg])
+        memory = Memory(*np.clip([memory.depth_mm + error_mm, memory.angle_deg + error_deg], -bounds, bounds).tolist())
+    press_mm = spec.kp_depth * error_mm + spec.ki_depth * memory.depth_mm
+    turn_deg = spec.kp_angle * error_deg + spec.ki_angle * memory.angle_deg
+    turn_deg = float(np.clip(turn_deg, -spec.largest_turn_deg, spec.largest_turn_deg))
+    step_mm = spec.feed_mm * mounting.across + press_mm * axis
+    step_mm *= min(1.0, spec.largest_move_mm / max(float(np.linalg.norm(step_mm)), 1e-9))
+    T = matrix_of(pose)
+    T[:3, :3] = T_base_surface[:3, :3] @ Rotation.from_rotvec(np.radians(now.angle_deg + turn_deg) * out_of_plane).as_matrix()
+    T[:3, 3] += T_base_surface[:3, :3] @ step_mm
+    return LawStep(pose_of(T, pose), memory)
+
 
 LOG = logging.getLogger(__name__)
 # Largest lag of the arm behind its target, in largest moves of the servo. An arm that lags farther gets no new target.
@@ -240,7 +337,7 @@ class ServoLoop:
 
     def _touch(self, target: np.ndarray) -> None:
         """Move straight to a pose (6,) in contact. Near the object each piece of the way follows a frame that shows its beginning."""
-        near_mm = max(self.servo.indent_mm, 0.0) + PIECES_MM if self.source.streams else 0.0
+        near_mm = max(self.servo.indent_mm, 0.0) + NEAR_MM if self.source.streams else 0.0
         for pose in pieces_to(self.mover.state().pose, self.mover.turned_for(target), near_mm):
             if near_mm:
                 with ErrorsAs(TimeoutError, lambda error: BlindError(f"{error}; {self.arm.name} moves only with fresh frames")):
@@ -251,18 +348,12 @@ class ServoLoop:
         """Figures of the steps so far."""
         fresh = [record for record in self.records if record.fresh]
         spent_s = max(self._ended_s - self._started_s, 1e-9)
-        return Timing(
-            len(self.records),
-            len(self.records) / spent_s,
-            len(fresh) / spent_s,
-            TimeSpread.of([record.latency_s for record in fresh]),
-            TimeSpread.of([age_s for _, age_s in self.decided if np.isfinite(age_s)]),
-            TimeSpread.of([record.compute_s for record in fresh]),
-            self.source.dropped,
-            len(self.decided) / spent_s,
-            {str(code): count for code in Decided if (count := sum(one is code for one, _ in self.decided))},
-            self.source.notes(),
-        )
+        rate_hz, fresh_hz, decided_hz = (len(made) / spent_s for made in (self.records, fresh, self.decided))
+        latency, compute = (TimeSpread.of([getattr(record, key) for record in fresh]) for key in ("latency_s", "compute_s"))
+        age = TimeSpread.of([age_s for _, age_s in self.decided if np.isfinite(age_s)])
+        decided = {str(code): count for code in Decided if (count := sum(one is code for one, _ in self.decided))}
+        dropped, notes = self.source.dropped, self.source.notes()
+        return Timing(len(self.records), rate_hz, fresh_hz, latency, age, compute, dropped, decided_hz, decided, notes)
 
     def _follow(self) -> None:
         """Take frames and decide on each one, until all steps are made or the recording ends."""
@@ -370,11 +461,8 @@ class ServoLoop:
             latency_s=now_s - view.frame.time_s,
             compute_s=now_s - taken_s,
             names=tuple(view.estimate.names),
-            value=view.estimate.value,
-            low=view.estimate.low,
-            high=view.estimate.high,
-            depth_mm=view.reading.depth_mm,
-            angle_deg=view.reading.angle_deg,
+            **{key: getattr(view.estimate, key) for key in ("value", "low", "high")},
+            **vars(view.reading),
             pose=from_pose,
             exposed_pose=view.exposed_pose,
             joints_deg=state.joints_deg,
@@ -398,7 +486,7 @@ class ServoLoop:
 
     def _exposed_after(self, time_s: float) -> Frame:
         """The first frame exposed after a time; raises ``TimeoutError`` if none comes. The wait also ends if the arm is lost."""
-        return self.mover.frame_after(time_s, timeout_s=self.settings.frame_timeout_s)
+        return self._watch.frame_after(self.source, time_s, timeout_s=self.settings.frame_timeout_s)
 
     def _reading(self, estimate: Estimate) -> tuple[Reading, str]:
         """Depth and angle of an estimate, and the reason why they can't be trusted ("" if they can)."""

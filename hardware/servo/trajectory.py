@@ -11,8 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from hardware.rig.geometry import PlacedObject
-from hardware.servo.law import Reading, tangent_of
-from hardware.servo.loop import StepRecord
+from hardware.servo.loop import Reading, StepRecord, tangent_of
 from twin.report.charts import muted_colour, new_figure
 from twin.report.table import write_table
 from twin.report.themes import BLUE, RED
@@ -134,24 +133,19 @@ def surface_place(mounting: Mounting, record: StepRecord) -> np.ndarray:
 
 def measure(path: Trajectory, *, indent_mm: float, angle_deg: float, wanted_mm: float) -> Measures:
     """Measures of a trajectory, for a reference depth and angle and a wanted distance along the outline."""
-    late = slice(min(SETTLING_N, max(len(path.depth_mm) - 1, 0)), None)
+    steps, tool, completed = len(path.depth_mm), path.tool_mm, float("nan")
+    late = slice(min(SETTLING_N, max(steps - 1, 0)), None)
 
     def mean_abs(values: np.ndarray) -> float:
         return float(np.abs(values[late]).mean()) if len(values[late]) else float("nan")
 
-    return Measures(
-        len(path.depth_mm),
-        smoothness(path.tool_mm),
-        local_smoothness(path.tool_mm),
-        float(np.sqrt((path.off_mm[late] ** 2).mean())) if len(path.off_mm) else float("nan"),
-        mean_abs(path.depth_mm - path.true_depth_mm),
-        mean_abs(path.angle_deg - path.true_angle_deg),
-        mean_abs(path.true_depth_mm - indent_mm),
-        mean_abs(path.true_angle_deg - angle_deg),
-        jerk(path.tool_mm),
-        float(np.clip(path.along_mm.max(initial=0.0) / wanted_mm, 0, 1)) if wanted_mm > 0 else float("nan"),
-        lost_contacts(path.true_indent_mm),
-    )
+    off = float(np.sqrt((path.off_mm[late] ** 2).mean())) if len(path.off_mm) else float("nan")
+    errors = mean_abs(path.depth_mm - path.true_depth_mm), mean_abs(path.angle_deg - path.true_angle_deg)
+    holds = mean_abs(path.true_depth_mm - indent_mm), mean_abs(path.true_angle_deg - angle_deg)
+    if wanted_mm > 0:
+        completed = float(np.clip(path.along_mm.max(initial=0.0) / wanted_mm, 0, 1))
+    lost = lost_contacts(path.true_indent_mm)
+    return Measures(steps, smoothness(tool), local_smoothness(tool), off, *errors, *holds, jerk(tool), completed, lost)
 
 
 def smoothness(points_mm: np.ndarray) -> float:

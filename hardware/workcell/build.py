@@ -4,32 +4,35 @@
 from which a model measures the pins' displacements.
 
 ``check_plan`` looks at the whole way before the first motion: the camera, the path to the object, and a way back from every planned pose.
+
+``Mover`` is the one way in which a program moves an arm to an object and away from it. Towards the object the arm moves only while the
+camera gives fresh frames (``FreshFrames``). A thread stops it if it no longer answers (``ArmWatch``). At the end it leaves the object
+straight, or the way it came if the limits forbid that.
 """
 
+import logging
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import KW_ONLY, dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 
-from hardware.arms.arm import Arm, ArmState
+from hardware.arms.arm import Arm, ArmState, SimulatedArm
+from hardware.arms.motion import turn_between_deg
 from hardware.arms.open_arm import kind_of, open_arm
-from hardware.arms.simulated import SimulatedArm
-from hardware.cameras.choose import open_camera
-from hardware.cameras.source import FrameSource, await_frame
-from hardware.cameras.twin import PoseSource, TwinCamera, preview_of
-from hardware.errors import DeviceError, leave
-from hardware.rig.geometry import PlacedObject, path_around
-from hardware.safety.decide import Action, decide, load_limits
-from hardware.safety.eyes import NEAR_MM, ArmWatch
-from hardware.safety.safe_arm import RETREAT_SHARES, SafeArm
+from hardware.cameras.source import FrameSource, await_frame, open_camera
+from hardware.cameras.twin import TwinCamera, preview_of
+from hardware.errors import DeviceError, leave, on_error
+from hardware.rig.geometry import HOLD_DEG, LastAxis, PlacedObject, path_around, shift_in_tool
+from hardware.safety.decide import Action, Sensed, decide, load_limits
+from hardware.safety.eyes import NEAR_MM, ArmWatch, FreshFrames
+from hardware.safety.safe_arm import RETREAT_SHARES, NoWayBackError, SafeArm, try_each
 from hardware.workcell.ros2 import publishing
-from scenes import ObjectSpec, PlacementSpec, SensorSpec
-from scenes.experiment import ExperimentSpec
+from scenes import ExperimentSpec, ObjectSpec, SensorSpec, ServoSpec
 from scenes.plugins import offered, others
 from twin.errors import ErrorsAs, FrameError, RenderError, format_count
 from twin.estimate import Estimate, SensorModel
@@ -118,60 +121,81 @@ class Rig:
 
     def __enter__(self) -> "Rig":
         self.arm.connect()
-        try:
+        with on_error(self.arm.disconnect):
             self.source.connect()
-        except BaseException:
-            self.arm.disconnect()
-            raise
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object, /) -> None:
         try:
             leave(self.arm.disconnect, error)
         finally:
             self.source.disconnect()
 
 
+@dataclass(frozen=True)
+class RigPlan:
+    """What the plans of all runs with a rig contain.
+
+    Attributes
+    ----------
+    obj : ObjectSpec
+        The object that is touched.
+    servo : ServoSpec
+        The arm's speeds, and the object's place.
+    camera : str
+        As for ``open_camera``, or ``WORLD:REST``, such as ``mujoco:SCENE``: a scene in the arm's base frame (see ``scenes.plugins``).
+    arm : str
+        As for ``open_arm``.
+    limits : str or None
+        Safety limits, by name or file. None: those of the arm's kind.
+    plain_light : bool
+        Draw the twin's frames with the lamps' direct light only. Otherwise a frame is path-traced at the start to add the indirect light.
+    also : tuple of str
+        Further formats in which the results are kept, each in a subfolder.
+    dry_run : bool
+        End after the check of the plan, before anything moves.
+    ros2 : str or None
+        Namespace in which frames, estimates or pins, and the arm's pose are published as ROS 2 topics.
+    """
+
+    obj: ObjectSpec
+    servo: ServoSpec
+    _: KW_ONLY
+    camera: str
+    arm: str
+    limits: str | None = None
+    plain_light: bool = False
+    also: tuple[str, ...] = ()
+    dry_run: bool = False
+    ros2: str | None = None
+
+
 def build_rig(
-    sensor: SensorSpec,
-    obj: ObjectSpec,
-    placement: PlacementSpec,
-    experiment: ExperimentSpec,
-    *,
-    camera: str,
-    arm: str,
-    form: Form | None = None,
-    limits: str | None = None,
-    seed: int = 0,
-    plain_light: bool = False,
-    at_once: bool = False,
+    plan: RigPlan, sensor: SensorSpec, experiment: ExperimentSpec, *, form: Form | None = None, seed: int = 0, at_once: bool = False
 ) -> Rig:
     """Build a rig from the user's options.
 
     Parameters
     ----------
-    camera : str
-        As for ``open_camera``, or ``WORLD:REST``, such as ``mujoco:SCENE``: a scene in the arm's base frame (see ``scenes.plugins``).
-    arm : str
-        As for ``open_arm``.
+    plan : RigPlan
+    sensor : SensorSpec
+    experiment : ExperimentSpec
     form : Form, optional
         Form of the frames. By default it is the form of the sensor's recordings, or raw if the sensor has none.
-    limits : str, optional
-        Name or file of the safety limits. By default they are the limits of this kind of arm.
-    plain_light : bool
-        Draw the twin's frames with the lamps' direct light only. Otherwise a frame is path-traced at the start to add the indirect light.
+    seed : int
+        Seed of the twin's noise.
     at_once : bool
         For callers that wait for a frame at each stop. A simulated arm in front of the twin's camera then moves instantly, and the twin
         draws a frame only while a reader waits for it.
     """
     form = form or (Form.PROCESSED if sensor.recording else Form.RAW)
-    placed = PlacedObject(obj, placement, Mounting.of(sensor, experiment))
-    device = open_guarded_arm(arm, limits, at_once=at_once and camera == TWIN)
+    placed = PlacedObject(plan.obj, plan.servo.placement, Mounting.of(sensor, experiment))
+    device = open_guarded_arm(plan.arm, plan.limits, at_once=at_once and plan.camera == TWIN)
+    camera, twin = plan.camera, None
     kind, _, rest = camera.partition(":")
     world = others("worlds")[kind](rest, sensor, placed.mounting.T_tool_sensor) if kind in offered("worlds") else None
-    twin = None
     if camera == TWIN or world is not None:
-        preview = draw_window(sensor, form, plain_light)
+        preview = draw_window(sensor, form, plan.plain_light)
         twin = TwinCamera(sensor, placed, device.state, form, seed=seed, preview=preview, on_demand=at_once, world=world)
     return Rig(open_camera(camera if twin is None else TWIN, sensor, form, twin=twin), device, placed, camera == TWIN)
 
@@ -184,11 +208,6 @@ def open_guarded_arm(arm: str, limits: str | None, *, at_once: bool) -> Arm:
     if kind_of(arm) == "simulated" and limits is None:  # by its name: an arm of another package is guarded, whatever class it has
         return device
     return SafeArm(device, load_limits(limits or kind_of(arm)))
-
-
-def twin_camera(sensor: SensorSpec, placed: PlacedObject, pose: PoseSource, form: Form, *, fps: float, plain_light: bool) -> TwinCamera:
-    """The twin as a camera on an arm that another process runs. If the connection to the arm is lost, the camera waits for it."""
-    return TwinCamera(sensor, placed, pose, form, fps=fps, preview=draw_window(sensor, form, plain_light), waits_for_arm=True)
 
 
 def draw_window(sensor: SensorSpec, form: Form, plain_light: bool) -> Preview:
@@ -261,10 +280,8 @@ def check_plan(
     way = [state.pose, *path_around(rig.placed, state.pose, clear), planned[0]]
     for start, end in pairwise(way):
         if why := _forbidden(rig.arm, start, end):
-            raise DeviceError(
-                f"{rig.arm.name}: the limits forbid the path to the {rig.placed.spec.name}: {why}; correct 'placement' in the file for "
-                "`servo` (a Magician reaches that of `servo=magician`), or `safety`"
-            )
+            remedy = "correct 'placement' in the file for `servo` (a Magician reaches that of `servo=magician`), or `safety`"
+            raise DeviceError(f"{rig.arm.name}: the limits forbid the path to the {rig.placed.spec.name}: {why}; {remedy}")
     blocked = [n for n, pose in enumerate(planned) if not _can_retreat(rig, pose)]
     if blocked[:1] == [0]:
         raise DeviceError(f"{rig.arm.name}: the limits allow no path back from the start; correct 'placement' in the file for `servo`")
@@ -328,3 +345,162 @@ def _can_retreat(rig: Rig, pose: np.ndarray) -> bool:
     back = np.zeros(6)
     back[:3] = -matrix_of(pose)[:3, :3] @ rig.mounting.axis * rig.arm.limits.retreat_mm
     return any(not _forbidden(rig.arm, pose, pose + share * back) for share in RETREAT_SHARES)
+
+
+LOG = logging.getLogger(__name__)
+# Largest number of pieces into which the limits may divide a move.
+MOST_PIECES = 200
+# Largest distance, mm, and turn, deg, between the end of a move and its target at which no further piece is needed.
+THERE_MM, THERE_DEG = 0.5, 0.5
+# Time in s that a move may take in addition to the duration that its path and speed give.
+MOVE_TIMEOUT_S = 10.0
+# Factor on the duration that a move's path and speed give, because arms round their speed to whole percents.
+SPARE = 2.0
+
+
+class Mover:
+    """Moves the arm of a connected rig to its object and away from it.
+
+    Parameters
+    ----------
+    rig : Rig
+    speed : (float, float)
+        Speed of the arm in mm/s and deg/s.
+    clear_mm : float
+        Distance by which an arm without limits is withdrawn.
+    patience_s : float
+        Longest wait for a fresh frame before a move.
+
+    Attributes
+    ----------
+    notes : list of str
+        Problems at the release.
+    """
+
+    def __init__(self, rig: Rig, speed: tuple[float, float], *, clear_mm: float, patience_s: float) -> None:
+        self.arm, self.source = rig.arm, rig.source
+        self.notes: list[str] = []
+        self.watch = rig.watch = ArmWatch(rig.arm)
+        self.eyes = FreshFrames(rig.arm, rig.source, self.watch.pose_at, lambda pose: float(rig.placed.touch(pose).indent_mm))
+        self.axis = LastAxis(getattr(rig.arm, "kinematics", None), rig.mounting.centre_mm)
+        self._placed, self._speed, self._clear_mm, self._patience_s = rig.placed, speed, clear_mm, patience_s
+        self._safe = rig.arm if isinstance(rig.arm, SafeArm) else None
+        self._came: list[np.ndarray] = []  # the poses (6,) at which the arm was since it stood clear of the object
+
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """Context in which the threads look at arm and camera."""
+        with self.watch.watching(), self.eyes.watching():
+            yield
+
+    def enable(self) -> None:
+        """Wait for a fresh frame, then enable the arm and set its speed."""
+        self.forget()  # the contact of an earlier run
+        with self.watch.doing("waiting for a fresh frame"):
+            self.eyes.await_frame(timeout_s=max(self._patience_s, self.source.first_frame_s))
+        with self.watch.doing("enabling"):
+            self.arm.enable()
+            self.arm.set_speed(*self._speed)
+
+    def state(self) -> ArmState:
+        """The arm's newest state, which the watch also keeps; ``DeviceError`` if the arm was lost or reports an error."""
+        self.watch.require()
+        state = self.arm.state()
+        if state.error:
+            raise DeviceError(f"{self.arm.name}: {state.error}")
+        self.watch.add(state)
+        return state
+
+    def sense(self, sensed: Sensed) -> None:
+        """Report the estimated contact to the limits of a ``SafeArm``."""
+        if self._safe is not None:
+            self._safe.sense(sensed)
+
+    def forget(self) -> None:
+        """Drop this contact, because the sensor leaves the object."""
+        if self._safe is not None:
+            self._safe.forget_contact()
+
+    def go_around(self, clear: np.ndarray) -> ArmState:
+        """Move around the object to a pose (6,) clear of it. Returns the state there."""
+        for pose in path_around(self._placed, self.state().pose, clear):
+            state = self.go(self.turned_for(pose))
+        self._came.clear()
+        return state
+
+    def go(self, target: np.ndarray) -> ArmState:
+        """Move straight to a pose (6,), in several pieces if the limits shorten the move. Returns the state that confirms it."""
+        for _ in range(MOST_PIECES):
+            self.eyes.await_frame(timeout_s=self._patience_s)
+            sent = self.send(target)
+            state = self.settle(sent)
+            if np.linalg.norm(sent[:3] - target[:3]) < THERE_MM and turn_between_deg(sent, target) < THERE_DEG:
+                return state
+        short_mm = float(np.linalg.norm(sent[:3] - target[:3]))
+        raise DeviceError(f"{self.arm.name}: {MOST_PIECES} moves end {short_mm:.1f} mm from the target; allow longer steps in `safety`")
+
+    def send(self, target: np.ndarray) -> np.ndarray:
+        """Send a move to a pose (6,), while frames are fresh. Returns the pose that was commanded."""
+        here = self.state().pose
+        self._came.append(here)
+        return self.eyes.move(partial(self.arm.move_linear, target, wait=False, timeout_s=self._lasts_s(here, target)), ends=False)
+
+    def settle(self, sent: np.ndarray) -> ArmState:
+        """Wait for the end of a move to a pose (6,), while frames are fresh. Returns the state there."""
+        return self.eyes.move(partial(self.arm.wait_settled, sent, timeout_s=self._lasts_s(self.arm.state().pose, sent)))
+
+    def turned_for(self, target: np.ndarray) -> np.ndarray:
+        """The target (6,) on the present turn of the last axis, after a turn back if one is needed."""
+        here = self.state().pose
+        pose, held_deg = self.axis.on_turn(target, here[5])
+        if held_deg <= HOLD_DEG:
+            return pose
+        turned = self.axis.turned_back(here, target)
+        if turned is None:
+            remedy = "turn the object ('placement.turn_deg' in a file for `servo`), or give no more `steps` than were made"
+            raise DeviceError(f"{self.arm.name}: its last axis can't turn the sensor that far, {held_deg:.0f} deg are missing; {remedy}")
+        for share in (1 / 3, 2 / 3, 1.0):  # each part is less than half a turn, so that its direction is unambiguous
+            self.go(here + share * (turned - here))
+        return self.axis.on_turn(target, turned[5])[0]
+
+    def away_from(self, pose: np.ndarray) -> np.ndarray:
+        """The pose (6,) withdrawn by ``clear_mm`` along the sensor's axis."""
+        return shift_in_tool(pose, -self._clear_mm * self._placed.mounting.axis)
+
+    def release(self, *, touching: bool) -> list[str]:
+        """Stop the arm, withdraw it if it may touch the object, and disable it. Every step is tried, even if one before it failed.
+
+        Returns the failures, which are also added to ``notes``.
+        """
+        back: dict[str, Callable[[], object]] = {"retreat": self._withdraw} if touching else {}
+        with self.watch.doing("withdrawing"):
+            failed = try_each(stop=self.arm.stop, **back, disable=self.arm.disable)
+        self.notes += failed
+        return failed
+
+    def _withdraw(self) -> None:
+        """Leave the object straight, or through the poses at which the arm was. This needs no frames."""
+        try:
+            self._retreat(self.arm.state().pose)
+        except NoWayBackError as error:
+            if not self._came:
+                raise
+            self.notes.append(f"{error}; returned on its own path instead")
+            LOG.warning("%s: %s", self.arm.name, self.notes[-1])
+            self.forget()
+            for there in reversed(self._came):
+                self.arm.move_linear(there, timeout_s=MOVE_TIMEOUT_S)
+
+    def _retreat(self, pose: np.ndarray) -> None:
+        """Withdraw the arm straight; ``NoWayBackError`` if its limits do not allow it."""
+        if self._safe is None:
+            self.arm.move_linear(self.axis.on_turn(self.away_from(pose), pose[5])[0], timeout_s=MOVE_TIMEOUT_S)
+            return
+        self._safe.normal = -matrix_of(pose)[:3, :3] @ self._placed.mounting.axis
+        if self._safe.retreat() is None:
+            raise NoWayBackError(f"the limits allow no path back: {self._safe.decisions[-1].decision.reason}; free the sensor by hand")
+
+    def _lasts_s(self, here: np.ndarray, target: np.ndarray) -> float:
+        """Longest time that a move between poses (6,) may take."""
+        way_s = max(float(np.linalg.norm(target[:3] - here[:3])) / self._speed[0], abs(target[5] - here[5]) / self._speed[1])
+        return MOVE_TIMEOUT_S + SPARE * way_s

@@ -17,14 +17,12 @@ import numpy as np
 import pytest
 from noisy_camera import NoisyCamera, number_of
 
-from hardware.arms.simulated import SimulatedArm
+from hardware.arms.arm import SimulatedArm
 from hardware.cameras import reader
-from hardware.cameras.choose import open_camera
 from hardware.cameras.mjpeg import CONTENT_TYPE, MjpegCamera, Parts, jpeg_of, write_part
 from hardware.cameras.reader import FIRST_PERIODS, MOST_FAILED_READS, OUTAGE_PERIODS, ReadFailed
-from hardware.cameras.source import FrameSource
+from hardware.cameras.source import FrameSource, UvcCamera, apply_settings, exposed_s, measure_settings, node_at, open_camera
 from hardware.cameras.twin import TwinCamera
-from hardware.cameras.uvc import UvcCamera, apply_settings, exposed_s, measure_settings, node_at
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceError, StaleDataError
 from hardware.live.doctor import cameras

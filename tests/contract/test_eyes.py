@@ -16,7 +16,7 @@ from noisy_camera import NoisyCamera
 from pins_camera import AT_REST, SENSOR, StudioModel, Switched, shows
 from true_estimator import TrueEstimate, TrueEstimator
 
-from hardware.arms.simulated import SimulatedArm
+from hardware.arms.arm import SimulatedArm
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.reader import DevicePicture
 from hardware.collect.collect import LIFT_MM, Collection, CollectPlan, collect, collect_frames
@@ -331,7 +331,17 @@ def test_nothing_moves_with_a_camera_that_does_not_show_the_sensor(monkeypatch, 
         monkeypatch.setattr("hardware.workcell.build.open_arm", lambda _: at.arm)
         arm, before = "mg400:any", at.reads()
         if command == "collect":
-            plan = CollectPlan(SENSOR, can, load_experiment("surface-2d"), spec, "any", arm, 1, form=Form.RAW, dry_run=True)
+            plan = CollectPlan(
+                can,
+                spec,
+                sensor=SENSOR,
+                experiment=load_experiment("surface-2d"),
+                camera="any",
+                arm=arm,
+                count=1,
+                form=Form.RAW,
+                dry_run=True,
+            )
             run = partial(collect_frames, plan, tmp_path)
         else:
             at_rest = "none" if "without" in command else "first"

@@ -8,7 +8,7 @@ from arms import mg400_of
 from noisy_camera import NoisyCamera
 from true_estimator import TrueEstimator
 
-from hardware.arms.kinematics import MG400
+from hardware.arms.motion import MG400
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.rig.geometry import HOLD_DEG, LastAxis, PlacedObject, turns_back_mm
 from hardware.safety.decide import load_limits

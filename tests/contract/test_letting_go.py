@@ -14,7 +14,7 @@ from noisy_camera import NoisyCamera
 from pins_camera import AT_REST, StudioModel, shows
 from true_estimator import TrueEstimator
 
-from hardware.arms.simulated import SimulatedArm
+from hardware.arms.arm import SimulatedArm
 from hardware.collect.collect import Collection, collect
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError, DeviceNotConnectedError

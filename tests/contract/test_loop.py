@@ -9,9 +9,9 @@ from faulty_arm import ArmFault, FaultyArm
 from noisy_camera import NoisyCamera
 from true_estimator import TrueEstimate, TrueEstimator
 
-from hardware.arms.simulated import SimulatedArm
+from hardware.arms.arm import SimulatedArm
 from hardware.cameras.mjpeg import MjpegCamera
-from hardware.cameras.recorded import SessionSource
+from hardware.cameras.source import SessionSource
 from hardware.emulators.camera import CameraEmulator
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject

@@ -11,8 +11,8 @@ from true_estimator import TrueEstimator
 
 from hardware.cameras.twin import TwinCamera
 from hardware.collect.collect import Collection, collect
+from hardware.emulators.camera import FeedbackPose
 from hardware.emulators.mg400 import Mg400Emulator
-from hardware.emulators.twin_camera import FeedbackPose
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject
 from hardware.safety.decide import SafetyLimits
@@ -101,7 +101,7 @@ def test_a_lost_arm_is_told_while_a_frame_is_waited_for(emulator, placed, tmp_pa
     clock = Clock(emulator, "frozen=0")
     arm = SafeArm(mg400_of(emulator), FREE)
     with pytest.MonkeyPatch.context() as patch, Blind() as source:
-        patch.setattr("hardware.workcell.mover.ArmWatch", lambda arm: ArmWatch(arm, report=clock.tell))
+        patch.setattr("hardware.workcell.build.ArmWatch", lambda arm: ArmWatch(arm, report=clock.tell))
         with pytest.raises(DeviceError) as raised, arm:
             about = Collection(tmp_path, {"seed": 1}, Form.RAW)
             collect(Rig(source, arm, placed, False), load_experiment("surface-2d"), about, 3, seed=1, speed=(200.0, 200.0))

@@ -14,8 +14,7 @@ import pytest
 import serial
 from tried_faults import tried_in
 
-from hardware.arms.magician import Magician
-from hardware.arms.magician_wire import BAUD, QUEUED, WRITE, Id, Message, Ptp, take_message
+from hardware.arms.magician import BAUD, QUEUED, WRITE, Id, Magician, Message, Ptp, take_message
 from hardware.emulators.magician import FAULTS, MagicianEmulator
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
 from twin.errors import TwinError

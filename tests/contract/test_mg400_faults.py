@@ -10,10 +10,9 @@ import pytest
 from arms import mg400_of
 from tried_faults import tried_in
 
-from hardware.arms import kinematics as arms
+from hardware.arms import motion
 from hardware.arms.mg400 import Mg400Ports
-from hardware.arms.mg400_link import CommandPort, Feedback
-from hardware.arms.mg400_wire import PACKET, PACKET_BYTES, TEST_VALUE, newest_packet, take_reply
+from hardware.arms.mg400_wire import PACKET, PACKET_BYTES, TEST_VALUE, CommandPort, Feedback, newest_packet, take_reply
 from hardware.emulators.mg400 import FAULTS, Mg400Emulator, feedback_packet
 from hardware.emulators.mg400_controller import RefusedError
 from hardware.errors import DeviceError, DeviceNotConnectedError, StaleDataError
@@ -228,7 +227,7 @@ def test_a_backlog_is_read_through_to_its_end():
 
 
 def test_unknown_targets_alarm_in_the_arm_if_the_driver_lets_them_through():
-    blind = replace(arms.MG400, limits_deg=((-360, 360),) * 4, linkage_deg=None)
+    blind = replace(motion.MG400, limits_deg=((-360, 360),) * 4, linkage_deg=None)
     with emulated(time_scale=4.0) as emulator, mg400_of(emulator, kinematics=blind) as arm:
         arm.enable()
         with pytest.raises(DeviceError, match="alarm 18"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from arms import bench, mg400_of
 
-from hardware.arms.newest import PIECE_S
+from hardware.arms.arm import PIECE_S
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError
 from hardware.live.lerobot import LeRobotArm

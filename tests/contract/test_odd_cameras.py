@@ -10,8 +10,8 @@ from odd_cameras import CATALOGUE, odd_camera
 from rtsp_camera import rtsp_camera
 
 from hardware.cameras import reader
-from hardware.cameras.choose import open_camera
 from hardware.cameras.mjpeg import without_secrets
+from hardware.cameras.source import open_camera
 from hardware.errors import DeviceError
 
 SECRETS = re.compile(r"s3cret|hunter2|admin")

@@ -21,10 +21,9 @@ pytest.importorskip("cyclonedds", reason="cyclonedds (the extra ros2) is not ins
 from drawn_frames import drawn_frame
 from hypothesis import HealthCheck, given, settings
 
-from hardware.cameras.choose import open_camera
 from hardware.cameras.mjpeg import jpeg_of
 from hardware.cameras.reader import LiveSource, ReadFailed
-from hardware.cameras.ros2 import Ros2Camera
+from hardware.cameras.source import Ros2Camera, open_camera
 from hardware.errors import DeviceError
 from hardware.live.doctor import ros2_topics
 from hardware.ros2 import dds

@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from hardware.arms.simulated import SimulatedArm
+from hardware.arms.arm import SimulatedArm
 from hardware.cameras.twin import TwinCamera
 from hardware.rig.geometry import PlacedObject, shift_in_tool
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor

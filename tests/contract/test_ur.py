@@ -11,11 +11,9 @@ import time
 import numpy as np
 import pytest
 
-from hardware.arms.kinematics import OutOfReachError
-from hardware.arms.motion import turn_between_deg
+from hardware.arms.motion import OutOfReachError, turn_between_deg
 from hardware.arms.open_arm import open_arm
-from hardware.arms.ur.driver import NORMAL
-from hardware.arms.ur.kinematics import MODELS, UrKinematics, pose_from_ur, pose_to_ur
+from hardware.arms.ur.driver import MODELS, NORMAL, UrKinematics, pose_from_ur, pose_to_ur
 from hardware.emulators.ur import UrEmulator
 from hardware.errors import DeviceError, DeviceNotConnectedError
 from hardware.rig.geometry import PlacedObject, poses_along

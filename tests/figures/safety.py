@@ -27,7 +27,7 @@ def safety_job(name: str, options: str, driver: str, minutes: float) -> Callable
         code=(
             "hardware.servo.loop",
             "hardware.collect.collect",
-            "hardware.workcell.mover",
+            "hardware.workcell.build",
             "hardware.safety.eyes",
             driver,
             "hardware.cameras.mjpeg",

@@ -7,10 +7,10 @@ from itertools import count
 
 import numpy as np
 
+from hardware.arms.arm import SimulatedArm
 from hardware.arms.magician import Magician
 from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.arms.ros2 import Ros2Arm
-from hardware.arms.simulated import SimulatedArm
 from hardware.arms.ur.driver import UR
 from hardware.emulators.magician import MagicianEmulator
 from hardware.emulators.mg400 import Mg400Emulator

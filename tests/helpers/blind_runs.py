@@ -89,6 +89,12 @@ PRESSED_MM = 6.0  # depth that the limits allow
 BUSY_S = 0.15
 
 
+class HastyRig(Rig):
+    """A rig that does not wait long for a frame."""
+
+    frame_timeout_s = FRAME_WAIT_S
+
+
 class DomeCamera(NoisyCamera):
     """Pictures of a size and a noise as a sensor's camera gives."""
 
@@ -190,7 +196,7 @@ def program(
     arm = SafeArm(device, limits)
     source = MjpegCamera(url, load_sensor("mg400-331"), Form.RAW)
 
-    rig = Rig(source, arm, placed, False)
+    rig = HastyRig(source, arm, placed, False)
 
     def run() -> None:
         with rig:
@@ -198,7 +204,7 @@ def program(
             if command == "collect":
                 about = Collection(folder, {"seed": 1}, Form.RAW)
                 experiment, speed = load_experiment("surface-2d"), (servo.linear_mm_s, servo.angular_deg_s)
-                collect(rig, experiment, about, 9 if steps == STEPS else 1, seed=1, speed=speed, frame_timeout_s=FRAME_WAIT_S)
+                collect(rig, experiment, about, 9 if steps == STEPS else 1, seed=1, speed=speed)
                 return
             track = SimpleNamespace(pose=pose or (lambda time_s: arm.state().pose))
             truth = TrueEstimator(SimpleNamespace(track=track), placed)

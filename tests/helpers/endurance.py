@@ -18,7 +18,7 @@ from free_ports import free_offset
 
 from hardware.arms.mg400_wire import DASHBOARD_PORT
 from hardware.servo.loop import Decided, LoopSettings, ServoLoop
-from hardware.workcell.build import build_rig
+from hardware.workcell.build import RigPlan, build_rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.errors import TwinError
 from twin.estimate import SensorModel
@@ -59,18 +59,16 @@ with Mg400Emulator(port_offset=int(sys.argv[1]), time_scale=float(sys.argv[2])) 
 """
 CAMERA = """
 import sys
-from hardware.emulators.camera import CameraEmulator
-from hardware.emulators.twin_camera import FeedbackPose
-from hardware.workcell.build import twin_camera
+from hardware.cameras.twin import TwinCamera
+from hardware.emulators.camera import CameraEmulator, FeedbackPose
 from hardware.rig.geometry import PlacedObject
 from scenes import load_experiment, load_object, load_sensor, load_servo
 from twin.rig.kinematics import Mounting
-from twin.types import Form
 arm, port, sensor, thing, servo, fps = sys.argv[1:]
 spec, how = load_sensor(sensor), load_servo(servo)
 placed = PlacedObject(load_object(thing), how.placement, Mounting.of(spec, load_experiment(how.experiment)))
 with FeedbackPose.of(arm) as pose:
-    source = twin_camera(spec, placed, pose, Form.RAW, fps=float(fps), plain_light=True)
+    source = TwinCamera(spec, placed, pose, fps=float(fps), waits_for_arm=True)
     with CameraEmulator(source, port=int(port)) as camera:
         print("ready", camera.url, flush=True)
         for line in sys.stdin:
@@ -242,9 +240,8 @@ def run_round(model: SensorModel, bench: Bench) -> Round:
     """Connect, follow a part of the object's outline, let go, disconnect."""
     servo = load_servo(SERVO)
     spec = load_sensor(SENSOR)
-    rig = build_rig(
-        spec, load_object(OBJECT), servo.placement, load_experiment(servo.experiment), camera=bench.url, arm=bench.address, form=model.form
-    )
+    plan = RigPlan(load_object(OBJECT), servo, camera=bench.url, arm=bench.address)
+    rig = build_rig(plan, spec, load_experiment(servo.experiment), form=model.form)
     settings = LoopSettings(ROUND_STEPS, blocking=False, period_s=1.0 / RATE_HZ, frame_timeout_s=rig.frame_timeout_s, give_up_s=GIVE_UP_S)
     began_s, told, loop = time.monotonic(), "", None
     try:

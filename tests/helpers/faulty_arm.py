@@ -4,8 +4,7 @@ import time
 from dataclasses import replace
 from enum import StrEnum
 
-from hardware.arms.arm import FEEDBACK_AGE_S
-from hardware.arms.simulated import SimulatedArm
+from hardware.arms.arm import FEEDBACK_AGE_S, SimulatedArm
 from hardware.errors import DeviceError, StaleDataError
 
 STALL_AFTER = 0.5  # share of a move's time after which a stalling arm stands still

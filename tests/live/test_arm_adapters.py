@@ -8,6 +8,7 @@ import pytest
 from noisy_camera import NoisyCamera
 from scipy.spatial.transform import Rotation
 
+from hardware.arms.arm import SimulatedArm
 from hardware.arms.cri import (
     AsyncBusy,
     AsyncNotBusy,
@@ -33,7 +34,6 @@ from hardware.arms.cri.transforms import (
 )
 from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.arms.motion import circle
-from hardware.arms.simulated import SimulatedArm
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceAlreadyConnectedError, DeviceError, DeviceNotConnectedError

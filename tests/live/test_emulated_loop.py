@@ -12,9 +12,8 @@ from hardware.arms.mg400 import MG400, Mg400Ports
 from hardware.arms.mg400_wire import DASHBOARD_PORT, FEEDBACK_PERIOD_S, MOTION_PORT
 from hardware.cameras.mjpeg import MjpegCamera
 from hardware.cameras.twin import TwinCamera
-from hardware.emulators.camera import CameraEmulator
+from hardware.emulators.camera import CameraEmulator, FeedbackPose
 from hardware.emulators.mg400 import Mg400Emulator
-from hardware.emulators.twin_camera import FeedbackPose
 from hardware.errors import DeviceError
 from hardware.rig.geometry import PlacedObject
 from hardware.safety.decide import load_limits

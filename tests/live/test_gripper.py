@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from noisy_camera import NoisyCamera
 
-from hardware.arms.simulated import SimulatedArm
+from hardware.arms.arm import SimulatedArm
 from hardware.cameras.twin import TwinCamera
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError

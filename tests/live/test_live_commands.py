@@ -20,9 +20,9 @@ from studio_client import StudioClient
 from true_estimator import TrueEstimate, TrueEstimator
 from typer.testing import CliRunner
 
-from hardware.arms.simulated import SimulatedArm
+from hardware.arms.arm import SimulatedArm
 from hardware.cameras.reader import DevicePicture, LiveSource
-from hardware.cameras.recorded import SessionSource
+from hardware.cameras.source import SessionSource
 from hardware.cameras.twin import preview_of
 from hardware.emulators.camera import CameraEmulator
 from hardware.emulators.faults import Emulator

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import twin
-from hardware.workcell.build import build_rig
+from hardware.workcell.build import RigPlan, build_rig
 from scenes import load_servo
 
 ROOT = Path(__file__).parents[2]
@@ -45,10 +45,10 @@ print("spiral", simulator.spec.pins.in_words(), len(state.caps_mm))
 camera = twin.open_camera("example:frames", simulator.spec, twin.Form.RAW)
 with camera: print("camera", camera.read().image.shape)
 
-from hardware.workcell.build import build_rig
+from hardware.workcell.build import RigPlan, build_rig
 from scenes import load_servo
-plane, placement, how = twin.load_object("plane"), load_servo("surface").placement, twin.load_experiment("surface-2d")
-rig = build_rig(simulator.spec, plane, placement, how, camera="example:frames", arm="example:here", form=twin.Form.RAW)
+plan = RigPlan(twin.load_object("plane"), load_servo("surface"), camera="example:frames", arm="example:here")
+rig = build_rig(plan, simulator.spec, twin.load_experiment("surface-2d"), form=twin.Form.RAW)
 print("guard", type(rig.arm).__name__, rig.arm.name)
 from hardware.servo.grip import GripPlan
 from training.environments.grasp import load_grasp_policy
@@ -110,6 +110,5 @@ def test_an_arm_without_limits_is_refused(monkeypatch):
     monkeypatch.setattr("scenes.plugins._found", {"arms": {"bare": lambda rest: twin.open_arm("simulated")}})
     how = twin.load_experiment("surface-2d")
     with pytest.raises(twin.errors.TwinError, match="no limits are called 'bare'"):
-        build_rig(
-            twin.load_sensor("mg400-127"), twin.load_object("plane"), load_servo("surface").placement, how, camera="twin", arm="bare:here"
-        )
+        plan = RigPlan(twin.load_object("plane"), load_servo("surface"), camera="twin", arm="bare:here")
+        build_rig(plan, twin.load_sensor("mg400-127"), how)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hardware.servo.loop import LoopSettings, ServoLoop
-from hardware.workcell.build import build_rig
+from hardware.workcell.build import RigPlan, build_rig
 from scenes import load_experiment, load_object, load_servo
 from training.estimate.estimator import PoseEstimator
 
@@ -24,17 +24,8 @@ def torn(image):
 )
 def test_a_strange_frame_holds_the_arm_and_the_next_good_one_goes_on(change):
     model, servo = PoseEstimator.load("mg400-331"), load_servo("surface")
-    rig = build_rig(
-        model.sensor,
-        load_object("can"),
-        servo.placement,
-        load_experiment(servo.experiment),
-        camera="twin",
-        arm="simulated",
-        form=model.form,
-        at_once=True,
-        plain_light=True,
-    )
+    plan = RigPlan(load_object("can"), servo, camera="twin", arm="simulated", plain_light=True)
+    rig = build_rig(plan, model.sensor, load_experiment(servo.experiment), form=model.form, at_once=True)
     answers, poses = [], []
 
     def estimate(frame):

@@ -7,8 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hardware.arms.kinematics import LINKAGE_ABOVE, MAGICIAN, MG400, OutOfReachError, StageKinematics
-from hardware.arms.motion import LINE_LEAVES_WORKSPACE, TARGET_LIMIT, MotionTrack, Speeds, check_line
+from hardware.arms.motion import (
+    LINE_LEAVES_WORKSPACE,
+    LINKAGE_ABOVE,
+    MAGICIAN,
+    MG400,
+    TARGET_LIMIT,
+    MotionTrack,
+    OutOfReachError,
+    Speeds,
+    StageKinematics,
+    check_line,
+)
 
 # J1 J2 J3 J4 (deg) and x y z R (mm, deg) that a real MG400 told of itself
 TOLD = np.array(

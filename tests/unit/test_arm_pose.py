@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from hardware.arms.mg400_wire import FEEDBACK_PERIOD_S
+from hardware.emulators.camera import FeedbackPose
 from hardware.emulators.mg400 import Mg400Emulator
-from hardware.emulators.twin_camera import FeedbackPose
 from hardware.errors import DeviceError
 from twin.errors import OptionError
 

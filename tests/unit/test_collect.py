@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from faulty_arm import ArmFault, FaultyArm
 
-from hardware.arms.simulated import SimulatedArm
+from hardware.arms.arm import SimulatedArm
 from hardware.cameras.reader import DevicePicture, LiveSource
 from hardware.collect.collect import COLUMNS, META, Collection, WorkFrame, collect, draw_contact
 from hardware.errors import DeviceError
@@ -187,7 +187,7 @@ def test_killed_before_the_first_row_it_begins_anew(rig, tmp_path):
 @pytest.mark.parametrize(("share", "reached"), [(0.5, True), (0.0, False)])
 def test_a_contact_that_the_arm_stops_short_of_is_not_the_one_that_was_asked_for(rig, tmp_path, share, reached, monkeypatch):
     experiment, placed, arm = rig
-    monkeypatch.setattr("hardware.workcell.mover.MOST_PIECES", 20)
+    monkeypatch.setattr("hardware.workcell.build.MOST_PIECES", 20)
     move = arm.move_linear
     arm.move_linear = lambda pose, **options: move(share * pose + (1 - share) * arm.state().pose, **options)
     if reached:

@@ -10,12 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from noisy_camera import NoisyCamera
 
-from hardware.cameras.choose import open_camera
+from hardware.cameras.source import open_camera
 from hardware.collect.collect import CollectPlan
-from hardware.emulators.camera import CameraEmulator
+from hardware.emulators.camera import CameraEmulator, emulate_camera
 from hardware.emulators.magician import MagicianEmulator
 from hardware.emulators.mg400 import Mg400Emulator
-from hardware.emulators.twin_camera import emulate_camera
 from hardware.errors import DeviceError
 from hardware.live.studio_mode import require_feed
 from hardware.safety.decide import load_limits
@@ -65,7 +64,8 @@ def test_steps_and_contacts_beyond_all_bounds_are_refused(count):
     with pytest.raises(DeviceError, match=f"`steps` {count}: expected 1 to"):
         FollowPlan(thing, servo, steps=count)
     with pytest.raises(DeviceError, match=f"`count` {count}: a collection has 1 to"):
-        CollectPlan(load_sensor("mg400-127"), thing, load_experiment("surface-2d"), servo, "twin", "simulated", count)
+        how = {"sensor": load_sensor("mg400-127"), "experiment": load_experiment("surface-2d")}
+        CollectPlan(thing, servo, **how, camera="twin", arm="simulated", count=count)
 
 
 NUMBERS = [

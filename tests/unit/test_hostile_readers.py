@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import save
 
-from hardware.cameras.recorded import SessionSource
+from hardware.cameras.source import SessionSource
 from hardware.collect.collect import Collection
 from scenes import SpecError, load_sensor
 from training.runs.run_files import unpack

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hardware.arms.magician_wire import QUEUED, WRITE, Id, Message, Ptp, take_message
+from hardware.arms.magician import QUEUED, WRITE, Id, Message, Ptp, take_message
 from hardware.emulators.faults import Faults
 from hardware.emulators.magician import FAULTS
 from hardware.emulators.magician_controller import FORMS, JOG_SPEEDS, SPEEDS, STORED, EmulatedController

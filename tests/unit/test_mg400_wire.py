@@ -8,8 +8,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from hardware.arms.dobot_alarms import ALARMS, explain
 from hardware.arms.mg400_wire import PACKET_BYTES, TEST_VALUE, Mode, newest_packet, take_reply, why_refused
+from hardware.arms.motion import ALARMS, explain
 from hardware.emulators.faults import Faults
 from hardware.emulators.mg400 import FAULTS, feedback_packet
 from hardware.emulators.mg400_commands import LONGEST_REQUEST, Mg400Commands, take_request

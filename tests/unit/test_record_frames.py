@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import hardware.collect.record as module
-from hardware.cameras.choose import open_camera
 from hardware.cameras.mjpeg import LINE, PicturePage
+from hardware.cameras.source import open_camera
 from hardware.collect.record import GIVE_UP_S, PATIENCE_S, describe_picture, record_frames
 from hardware.errors import DeviceError
 from twin.frames import open_recording

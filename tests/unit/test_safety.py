@@ -8,9 +8,8 @@ from faulty_arm import ArmFault, FaultyArm
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hardware.arms.arm import ArmState
-from hardware.arms.kinematics import MG400
-from hardware.arms.simulated import SimulatedArm
+from hardware.arms.arm import ArmState, SimulatedArm
+from hardware.arms.motion import MG400
 from hardware.errors import DeviceError
 from hardware.safety.decide import SHIPPED_LIMITS, Action, DecisionCode, SafetyLimits, Sensed, clip, decide, decide_joints, load_limits
 from hardware.safety.safe_arm import RefusedMoveError, SafeArm

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hardware.rig.geometry import PlacedObject, shift_in_tool
-from hardware.servo.law import Memory, Reading, reading_at, servo_step, tangent_of
+from hardware.servo.loop import Memory, Reading, reading_at, servo_step, tangent_of
 from hardware.servo.trajectory import distance_along, jerk, local_smoothness, lost_contacts, smoothness
 from scenes import PlacementSpec, load_experiment, load_object, load_sensor, load_servo
 from twin.rig.arm_pose import matrix_of, pose_of

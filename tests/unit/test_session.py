@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from hardware.cameras.recorded import SessionSource
+from hardware.cameras.source import SessionSource
 from twin.errors import FrameError, StoreError
 from twin.frames.images import write_image
 from twin.records import open_records

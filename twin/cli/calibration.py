@@ -67,7 +67,7 @@ def record(
       twin record --camera 0 --out recordings/mine
       twin new recordings/mine --out mine.toml
     """
-    from hardware.cameras.choose import open_camera
+    from hardware.cameras.source import open_camera
     from hardware.collect.record import record_frames
 
     return record_frames(open_camera(camera), out, count=count, port=port, progress=progress)
@@ -126,7 +126,7 @@ def new_sensor(
           --out mine.toml
       twin new --camera /dev/video0 --out mine.toml
     """
-    from hardware.cameras.choose import open_camera
+    from hardware.cameras.source import open_camera
     from hardware.collect.record import record_frames
     from scenes.pins import layout_from
     from twin.calibration.go_on import whole_sensor

@@ -458,7 +458,6 @@ def camera(
       twin emulate camera --arm mg400:127.0.0.1 --sensor mg400-331 --object can \\
           --port 8081
     """
-    from hardware.emulators.camera import FAULTS
-    from hardware.emulators.twin_camera import emulate_camera
+    from hardware.emulators.camera import FAULTS, emulate_camera
 
     call(emulate_camera, locals(), faults=faults_of(fault, FAULTS))

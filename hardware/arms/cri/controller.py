@@ -6,19 +6,17 @@
 import time
 import warnings
 from abc import ABC, abstractmethod
-from types import TracebackType
 from typing import Self
 
 import numpy as np
 
-from hardware.arms.arm import Arm
+from hardware.arms.arm import Arm, NewestTarget
 from hardware.arms.cri.transforms import Numbers, euler2mat, mat2euler, mat2quat, quat2mat
 from hardware.arms.mg400 import MG400
 from hardware.arms.mg400_wire import DEFAULT_HOSTS, MAX_JOINT_DEG_S, MAX_LINEAR_MM_S
 from hardware.arms.motion import circle, way_between
-from hardware.arms.newest import NewestTarget
 from hardware.arms.open_arm import open_arm
-from hardware.errors import DeviceError, leave, undo
+from hardware.errors import DeviceError, leave, on_error
 
 # Speeds at the start, as in cri: % of the MG400's largest speed, mm/s and deg/s for other arms.
 START_SPEED = 20.0
@@ -36,7 +34,7 @@ class Closing(ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object, /) -> None:
         leave(self.close, error)
 
     @property
@@ -96,13 +94,10 @@ class RobotController(Closing):
         self.commanded_pose: np.ndarray | None = None
         self.commanded_joint_angles: np.ndarray | None = None
         self.arm.connect()
-        try:
+        with on_error(self.arm.disconnect):
             self.arm.clear_error()
             self.arm.enable()
             self._set_speeds()
-        except BaseException as error:
-            leave(self.arm.disconnect, error)
-            raise
 
     @property
     def info(self) -> str:
@@ -213,13 +208,9 @@ class RobotController(Closing):
         if self._newest is None:
             self._newest = NewestTarget(self.arm, *self._speeds())
             self._newest.start()
-        try:
+        with on_error(self.arm.stop), on_error(self._end_servo):
             self._newest.go(flange)
             time.sleep(delay_s)
-        except BaseException as error:
-            self._end_servo()
-            undo(self.arm.stop, error)
-            raise
 
     def _end_servo(self) -> None:
         if self._newest is not None:

@@ -4,8 +4,8 @@
 """
 
 from collections.abc import Callable
+from operator import attrgetter
 from threading import Thread
-from typing import Any
 
 import numpy as np
 
@@ -30,17 +30,9 @@ class AsyncNotBusy(DeviceError):  # noqa: N818  (cri's name)
     """No move was started."""
 
 
-class _OfController:
-    """A property of a robot that is its controller's property of the same name."""
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = name
-
-    def __get__(self, robot: "SyncRobot | None", owner: type | None = None) -> Any:
-        return self if robot is None else getattr(robot.controller, self._name)
-
-    def __set__(self, robot: "SyncRobot", value: float) -> None:
-        setattr(robot.controller, self._name, value)
+def _of_controller(name: str) -> property:
+    """A property of a robot that is its controller's property of this name."""
+    return property(attrgetter(f"controller.{name}"), lambda robot, value: setattr(robot.controller, name, value))
 
 
 class SyncRobot(Closing):
@@ -55,16 +47,13 @@ class SyncRobot(Closing):
     """
 
     EULER_AXES = EULER_AXES
+    info = _of_controller("info")
     elbow = target_elbow = None
 
     def __init__(self, controller: RobotController) -> None:
         self.controller = controller
         self._axes = "sxyz"
         self._T_base_work = self._T_tip_flange = np.eye(4)
-
-    @property
-    def info(self) -> str:
-        return self.controller.info
 
     @property
     def axes(self) -> str:
@@ -103,9 +92,10 @@ class SyncRobot(Closing):
     def coord_frame(self, frame: Numbers) -> None:
         self._T_base_work = transforms.euler2mat(frame, self._axes)
 
-    linear_speed, angular_speed = _OfController(), _OfController()
-    speed, blend_radius = _OfController(), _OfController()
-    joint_angles = _OfController()  # present joints (J,), deg
+    linear_speed, angular_speed = _of_controller("linear_speed"), _of_controller("angular_speed")
+    speed, blend_radius = _of_controller("speed"), _of_controller("blend_radius")
+    # joints (J,), deg: the present ones, and those that were commanded last (None before the first move)
+    joint_angles, target_joint_angles = _of_controller("joint_angles"), _of_controller("commanded_joint_angles")
 
     @property
     def pose(self) -> np.ndarray:
@@ -116,11 +106,6 @@ class SyncRobot(Closing):
         """The last requested pose; None before the first one."""
         commanded = self.controller.commanded_pose
         return None if commanded is None else self._from_controller(commanded)
-
-    @property
-    def target_joint_angles(self) -> np.ndarray | None:
-        """Joints that were commanded last (J,), deg; None before the first move."""
-        return self.controller.commanded_joint_angles
 
     def move_joints(self, joint_angles: Numbers) -> None:
         if not FEWEST_JOINTS <= len(joint_angles) <= MOST_JOINTS:

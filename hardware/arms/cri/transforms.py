@@ -31,10 +31,7 @@ def euler2mat(pose: Numbers, axes: str = "sxyz") -> np.ndarray:
     numbers = np.asarray(pose, float).ravel()
     if numbers.size != 6:
         raise InvalidEulerPose(f"a pose has 6 numbers (x, y, z in mm and three angles in deg), got {numbers.size}")
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler(_scipy_axes(axes), numbers[3:], degrees=True).as_matrix()
-    T[:3, 3] = numbers[:3]
-    return T
+    return quat2mat(np.r_[numbers[:3], Rotation.from_euler(_scipy_axes(axes), numbers[3:], degrees=True).as_quat(scalar_first=True)])
 
 
 def mat2euler(T: np.ndarray, axes: str = "sxyz") -> np.ndarray:

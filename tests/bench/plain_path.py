@@ -5,7 +5,7 @@ import numpy as np
 from twin.camera.projection import project
 from twin.geometry.pins import rest_pins
 from twin.optics.render import BOUNCES, Renderer
-from twin.optics.scalar import ScalarView
+from twin.optics.scene import ScalarView
 from twin.optics.variants.variant import use_variant
 
 

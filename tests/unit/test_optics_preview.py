@@ -8,7 +8,7 @@ from scenes.sensor import SensorSpec
 from twin.camera.projection import pixel_rays, project
 from twin.errors import RenderError
 from twin.geometry.pins import PinRest, rest_pins
-from twin.optics.direct_light import DirectLight, lights
+from twin.optics.direct_light import DirectLight
 from twin.optics.preview import Preview, Shading
 
 NOTHING = (0.0, 0.0)  # no light from elsewhere, nothing covered
@@ -52,7 +52,7 @@ def straight(small) -> SensorSpec:
 
 
 def direct_light(spec: SensorSpec) -> DirectLight:
-    return DirectLight(spec.lens, spec.gel, lights(spec.leds, spec.housing))
+    return DirectLight(spec)
 
 
 def area_and_centroid(polygon: np.ndarray) -> tuple[float, np.ndarray]:
@@ -105,7 +105,7 @@ def test_all_light_that_enters_the_gel_crosses_each_plane_in_it(depth_mm):
 
 def test_a_way_to_the_camera_is_the_ray_of_the_pixel(small):
     rest = rest_pins(small.geometry)
-    toward, length = direct_light(small).refracted_rays(rest.caps_mm, np.array([0.0, 0.0, -small.camera.distance_mm]))
+    toward, length, _ = direct_light(small).refracted_rays(rest.caps_mm, np.array([0.0, 0.0, -small.camera.distance_mm]))
     entry, inward = pixel_rays(small.view, project(small.view, rest.caps_mm))
     rounding = 1e-12
     np.testing.assert_allclose(toward, -inward, atol=rounding)

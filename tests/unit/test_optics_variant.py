@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from twin.errors import RenderError
-from twin.optics.variants import probes, variant
-from twin.optics.variants.probes import ProbeResult
+from twin.optics.variants import variant
+from twin.optics.variants.variant import ProbeResult
 
 RENDER_TINY = """
 import sys
@@ -129,11 +129,11 @@ def test_verdicts_are_remembered_until_the_library_changes(tmp_path, monkeypatch
     library, runs = tmp_path / "libLLVM.so.19.1", []
     library.touch()
     monkeypatch.setenv("TACTIP_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(probes, "_run", lambda backend, path: runs.append(path) or ProbeResult(True, "19.1", ""))
-    assert probes.probe("llvm", library) == probes.probe("llvm", library) == ProbeResult(True, "19.1", "")
+    monkeypatch.setattr(variant, "_run", lambda backend, path: runs.append(path) or ProbeResult(True, "19.1", ""))
+    assert variant.probe("llvm", library) == variant.probe("llvm", library) == ProbeResult(True, "19.1", "")
     assert len(runs) == 1
     os.utime(library, ns=(1, 1))
-    probes.probe("llvm", library)
+    variant.probe("llvm", library)
     assert len(runs) == 2
 
 

@@ -22,8 +22,8 @@ from twin.calibration.optics import _Log
 from twin.errors import StoreError
 from twin.mechanics.skin_fit import FittedPins
 from twin.mechanics.solver import SkinSolver
-from twin.optics.variants import probes
-from twin.optics.variants.probes import ProbeResult
+from twin.optics.variants import variant
+from twin.optics.variants.variant import ProbeResult
 from twin.store import (
     ArrayFile,
     Item,
@@ -58,7 +58,7 @@ KEEPERS = (  # the module of every function whose results are kept between runs
     "twin.mechanics.skin_fit",
     "twin.geometry.solid",
     "twin.optics.preview",
-    "twin.optics.variants.probes",
+    "twin.optics.variants.variant",
     "twin.optics.render",
     "twin.evaluation.degradation.shots",
     "twin.evaluation.degradation.sweep",
@@ -350,8 +350,8 @@ def test_probes_keep_nothing_where_the_cache_is_off(tmp_path, monkeypatch):
     library.touch()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("TACTIP_CACHE", "off")
-    monkeypatch.setattr(probes, "_run", lambda backend, path: runs.append(path) or ProbeResult(True, "19.1", ""))
-    assert probes.probe("llvm", library) == probes.probe("llvm", library) == ProbeResult(True, "19.1", "")
+    monkeypatch.setattr(variant, "_run", lambda backend, path: runs.append(path) or ProbeResult(True, "19.1", ""))
+    assert variant.probe("llvm", library) == variant.probe("llvm", library) == ProbeResult(True, "19.1", "")
     assert list(tmp_path.iterdir()) == [library] and len(runs) == 1
 
 

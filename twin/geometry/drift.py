@@ -6,8 +6,7 @@ no first pair has to be right, and a ring that is squeezed to half its spacing b
 """
 
 import numpy as np
-
-from twin.compiled import compiled
+from scipy.spatial.distance import cdist
 
 MOST_MOTIONS, LEAST_MOTION = 60, 1e-6
 """Largest number of coherent motions, and least eigenvalue of one relative to the largest."""
@@ -38,7 +37,10 @@ def drift(points: np.ndarray, others: np.ndarray, motions: np.ndarray, stiffness
     outliers = max(OUTLIERS, 1 - n / count)
     for _ in range(ROUNDS):
         uniform = 2 * np.pi * variance * outliers / (1 - outliers) * n / count
-        mass, drawn, square = _expect_masses(places, others, variance, uniform)
+        away = cdist(others, places, "sqeuclidean") / (2 * variance)
+        share = np.where(away < FARTHEST, np.exp(-away), 0)
+        share /= uniform + share.sum(axis=1, keepdims=True)
+        mass, drawn, square = share.sum(axis=0), share.T @ others, share.sum(axis=1) @ (others**2).sum(axis=1)
         inner = motions.T @ (mass[:, None] * motions) + stiffness * variance * unit
         places = points + motions @ np.linalg.solve(inner, motions.T @ (drawn - mass[:, None] * points))
         moved = square - 2 * (drawn * places).sum() + (mass * (places**2).sum(axis=1)).sum()
@@ -46,24 +48,3 @@ def drift(points: np.ndarray, others: np.ndarray, motions: np.ndarray, stiffness
         if abs(variance - before) < SETTLED * before:
             break
     return places
-
-
-@compiled()
-def _expect_masses(places: np.ndarray, others: np.ndarray, variance: float, uniform: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Mass (N,) of the others that each point draws, their sum (N, 2), and the sum of their squared distances from the origin."""
-    n = len(places)
-    mass, drawn, share, square = np.zeros(n), np.zeros((n, 2)), np.zeros(n), 0.0
-    for k in range(len(others)):
-        total = uniform
-        for i in range(n):
-            away = ((others[k, 0] - places[i, 0]) ** 2 + (others[k, 1] - places[i, 1]) ** 2) / (2 * variance)
-            share[i] = np.exp(-away) if away < FARTHEST else 0.0
-            total += share[i]
-        for i in range(n):
-            if share[i] > 0:
-                part = share[i] / total
-                mass[i] += part
-                drawn[i, 0] += part * others[k, 0]
-                drawn[i, 1] += part * others[k, 1]
-                square += part * (others[k, 0] ** 2 + others[k, 1] ** 2)
-    return mass, drawn, square

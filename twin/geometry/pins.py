@@ -148,6 +148,12 @@ def across_axis(axis: FloatArray) -> tuple[FloatArray, FloatArray]:
     return u, np.cross(u, axis)
 
 
+def around_axis(axis: FloatArray, turn: FloatArray) -> FloatArray:
+    """Unit vectors (N, k, 3) perpendicular to axes (N, 3) at azimuths (k,), which start at the sensor's x (as ``across_axis``)."""
+    u, v = across_axis(axis)
+    return np.cos(turn)[:, None] * u[:, None] + np.sin(turn)[:, None] * v[:, None]
+
+
 def rest_pins(geometry: GeometrySpec) -> PinRest:
     """Pins of a sensor at rest: the layout, mapped to the inside of its skin by the skin's shape and ``PinsSpec.spacing``."""
     pins = geometry.pins

@@ -162,15 +162,12 @@ def _gather(r: FloatArray, c: float) -> FloatArray:
 
 
 def _ungather(wanted: FloatArray, c: float) -> FloatArray:
-    """Inverse of ``_gather`` for values from 0 to 1, by Newton's method inside a shrinking bracket."""
-    r = np.sqrt(wanted)
-    low, high = np.zeros_like(r), np.ones_like(r)
+    """Inverse of ``_gather`` for values from 0 to 1, by Newton's method from above: s is convex there."""
+    r = np.ones_like(wanted)
     for _ in range(60):
-        off = c * r + (1 - c) * r**_POWER - wanted
-        low, high = np.where(off < 0, r, low), np.where(off > 0, r, high)
-        r = r - off / (c + _POWER * (1 - c) * r ** (_POWER - 1))
-        r = np.where((r < low) | (r > high), (low + high) / 2, r)
-        if np.abs(off).max(initial=0) < 1e-15:
+        step = (_gather(r, c) - wanted) / (c + _POWER * (1 - c) * r ** (_POWER - 1))
+        r = r - step
+        if np.abs(step).max(initial=0) < 1e-15:
             break
     return r
 

@@ -189,7 +189,7 @@ def build_solid(geometry: GeometrySpec, *, resolution: Resolution | None = None,
 
     fine = [_fit(basis, chart, geometry, depth) for depth in through_skin.greville]
     deep = [_fit(coarse, chart, geometry, depth) for depth in through.greville[1:]]
-    control = np.concatenate(fine + deep)
+    control = np.ascontiguousarray(np.concatenate(fine + deep))
     index = np.arange(len(fine) * side * side).reshape(-1, side, side)
     below = (len(fine) * side * side + np.arange(len(deep) * coarse_side**2)).reshape(-1, coarse_side, coarse_side)
     fixed_fine, fixed_coarse = np.zeros(index.shape, bool), np.zeros(below.shape, bool)

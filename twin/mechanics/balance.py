@@ -44,9 +44,8 @@ class Body:
         """
         if not self.sealed:
             return 0.0
-        gel = self.kinds[1:]
-        shear_modulus_mpa = 2 * float(gel[0].law[0] + gel[0].law[1])
-        return shear_modulus_mpa * float(self.points.area_mm2.sum()) / sum(kind.rest_volume_mm3 for kind in gel)
+        shear_modulus_mpa = 2 * float(self.kinds[1].law[:2].sum())
+        return shear_modulus_mpa * float(self.points.area_mm2.sum()) / sum(kind.rest_volume_mm3 for kind in self.kinds[1:])
 
 
 @dataclass(frozen=True)
@@ -135,7 +134,7 @@ class Balance:
 
 def in_object(points_mm: FloatArray, T: FloatArray, border: FloatArray) -> FloatArray:
     """Points (k, 3) of the sensor's frame in the frame of the object at ``T``, displaced by ``border[0]`` (mm) along z."""
-    return (points_mm - T[:3, 3] - [0, 0, border[0]]) @ T[:3, :3]
+    return points_mm @ T[:3, :3] - (T[:3, 3] + [0, 0, border[0]]) @ T[:3, :3]
 
 
 class Problem:

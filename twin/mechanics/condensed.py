@@ -14,20 +14,16 @@ the whole load step.
 
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
 from scipy.linalg import blas, lapack
 
-from twin.compiled import compiled
 from twin.mechanics.balance import FORCE_FLOOR_N, Balance, LoadState, Problem, in_object
 from twin.mechanics.body.linear import FrontalSolver
 from twin.mechanics.contact import ContactForces, positions, spread_forces, spread_stiffness
 from twin.mechanics.path import ContactPath
 from twin.mechanics.turns import turn_vectors, turned_back, turned_matrix
 from twin.types import BoolArray, FloatArray, IntArray
-
-Triple: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
 _ITERATIONS = 60
 """Largest number of Newton iterations on the small problem."""
@@ -70,7 +66,7 @@ class Tangent:
         Column of the sealed gel's pressure, which is one more unknown, after elimination. Zero for a gel that is not sealed.
     volume_pivot : float
         Diagonal entry of that pressure after elimination.
-    strains : list of float arrays
+    strains : (m, 3, 3) float
         State at which the tangent was computed (see ``Turns.strains``).
     local : (p, 9) int
         Index of each contact point's controls among the kept controls.
@@ -82,7 +78,7 @@ class Tangent:
     matrix: FloatArray  # (k, k), symmetric
     volume_column: FloatArray
     volume_pivot: float
-    strains: list[FloatArray]
+    strains: FloatArray
     local: IntArray
     turns: FloatArray | None = None
     _forward: tuple[FloatArray, FloatArray] | None = None
@@ -95,9 +91,9 @@ class Tangent:
     def forward(self, elastic: FloatArray, volume_mm3: float) -> tuple[FloatArray, float]:
         """Forces (unknowns,), rotated back to the state of the tangent, and a change of volume, both after forward elimination."""
         if self._forward is None or self._forward[0] is not elastic:
-            self._forward = elastic, self.eliminated.forward(elastic if self.turns is None else turned_back(self.turns, elastic))
+            self._forward = elastic, self.eliminated.forward(turned_back(self.turns, elastic))
         forward, inner = self._forward[1], self.eliminated.inner
-        return forward, np.float64(volume_mm3 - inner(self.volume_column) @ inner(forward))
+        return forward, np.float64(volume_mm3 - self.volume_column[inner] @ forward[inner])
 
     def near(self, looked: IntArray) -> "Near":
         """The tangent condensed to the candidate points (q,). The last result is stored."""
@@ -115,7 +111,7 @@ class Near:
     """The tangent, condensed further to the controls that carry the candidate points.
 
     Kept controls that carry a candidate point are "near", the other ones are "far" and are eliminated here. The far part of the tangent
-    is L L^T. All arrays are in single precision.
+    is L L^T. All arrays are computed in single precision.
 
     Attributes
     ----------
@@ -153,14 +149,14 @@ class Near:
         renumber = np.full(count // 3 + 1, len(controls))
         renumber[controls] = np.arange(len(controls))
         column = tangent.volume_column[tangent.eliminated.kept]
-        column, far_column = column[near], column[far]
+        column, far_column = column[near].astype(float), column[far]
         coupling = np.zeros((0, len(near)), np.float32)
         if len(far):
             coupling = blas.strsm(1.0, factor, across.T, lower=1, overwrite_b=1)
             far_column = lapack.strtrs(factor, far_column, lower=1)[0]
             rest = rest - coupling.T @ coupling
             column = column - coupling.T @ far_column
-        self.near, self.far, self.local, self.matrix, self.column = near, far, renumber[local], rest, column
+        self.near, self.far, self.local, self.matrix, self.column = near, far, renumber[local], rest.astype(float), column
         self.factor, self.coupling, self.far_column = factor, coupling, far_column
         self.turns: FloatArray | None = None
         self.solved: tuple[float, FloatArray, IntArray] | None = None
@@ -188,11 +184,10 @@ class SmallContact:
     def __init__(self, problem: Problem, tangent: Tangent, residual: FloatArray, volume_residual: float, balance: Balance) -> None:
         self._problem, self._border, self.iterations = problem, balance.border, 0
         near = self._near = tangent.near(problem.looked)
-        self._at = positions(problem.controls, problem.weights, problem.lift, balance.control_mm)
+        self._turn = np.ascontiguousarray(problem.T[:3, :3])
+        self._at = in_object(positions(problem.controls, problem.weights, problem.lift, balance.control_mm), problem.T, balance.border)
         self._far_residual = lapack.strtrs(near.factor, residual[near.far], lower=1)[0] if len(near.far) else residual[near.far]
-        self._r = residual[near.near] - near.coupling.T @ self._far_residual
-        if near.turns is not None:
-            self._r = turn_vectors(near.turns, self._r)
+        self._r = turn_vectors(near.turns, residual[near.near] - near.coupling.T @ self._far_residual)
         self._v = near.column
         self._g = volume_residual - near.far_column @ self._far_residual
         self._q = tangent.volume_pivot - near.far_column @ near.far_column
@@ -211,8 +206,7 @@ class SmallContact:
             y, _ = self.newton(y, wanted, _ITERATIONS)
         near = self._near
         out = np.zeros(len(near.near) + len(near.far))
-        moved = y[:-2] if near.turns is None else turned_back(near.turns, y[:-2])
-        out[near.near] = moved
+        out[near.near] = moved = turned_back(near.turns, y[:-2])
         if len(near.far):
             right = self._far_residual + near.far_column * y[-1] + near.coupling @ moved.astype(np.float32)
             out[near.far] = -lapack.strtrs(near.factor, right, lower=1, trans=1)[0]
@@ -220,7 +214,9 @@ class SmallContact:
 
     def places(self, y: FloatArray) -> FloatArray:
         """Candidate points (q, 3) after displacements ``y`` (n + 2,), in the object's frame."""
-        return _move_points(self._near.local, self._problem.weights, self._at, y, self._problem.T, self._border[0] + y[-2])
+        moved = np.zeros((len(y) // 3 + 1, 3))
+        moved[:-1] = y[:-2].reshape(-1, 3) @ self._turn
+        return positions(self._near.local, self._problem.weights, self._at - y[-2] * self._turn[2], moved)
 
     def newton(self, y: FloatArray, wanted: float, most: int, soften: float = 1.0) -> tuple[FloatArray, bool]:
         """Solve the problem with softened contact from a start (n + 2,), in at most ``most`` iterations.
@@ -261,10 +257,11 @@ class SmallContact:
     def _equations(self, y: FloatArray, soften: float) -> tuple[FloatArray, ContactForces]:
         problem, near = self._problem, self._near
         contact, out = problem.contact(self.places(y), soften), np.zeros(len(y))
-        carried = near.local, problem.weights, contact.force_n
-        force_z = _residual((near.matrix, self._v, self._r), y, carried, problem.T, out)
+        carried = np.zeros((len(y) // 3 + 1, 3))
+        spread_forces(near.local, problem.weights, contact.force_n, carried)
+        out[:-2] = self._r + self._v * y[-1] + near.matrix @ y[:-2] - (carried[:-1] @ self._turn.T).ravel()
         if problem.compliance:
-            out[-2] = (self._border[0] + y[-2]) / problem.compliance + force_z
+            out[-2] = (self._border[0] + y[-2]) / problem.compliance + contact.force_n.sum(axis=0) @ self._turn[2]
         out[-1] = problem.volume_force_n_per_mm3 * (self._g + self._v @ y[:-2] + self._q * y[-1])
         return out, contact
 
@@ -333,16 +330,14 @@ def friction_substeps(
     forward, volume = tangent.forward(balance.elastic, balance.border_residual[1])
     start: FloatArray = (state.control_mm - balance.control_mm)[problem.body.free].ravel()[kept]
     y = np.concatenate([start[near.near], state.border - balance.border])
-    if turns is not None:
-        turns = turns[kept[::3] // 3]
-        start = turned_back(turns, start)
-    start = start.astype(np.float32)
+    turns = None if turns is None else turns[kept[::3] // 3]
+    start = turned_back(turns, start).astype(np.float32)
     at_start = in_object(positions(problem.controls, problem.weights, problem.lift, state.control_mm), state.T, state.border)
     held = state.held[looked]
     pressed = problem.move_object(state.T, state.anchor_mm[looked], state.slid_mm[looked]).contact(at_start).force_n @ state.T[:3, :3].T
     spread = np.zeros((len(kept) // 3 + 1, 3))
     spread_forces(tangent.local[looked], problem.weights, pressed * held[:, None], spread)
-    residual_start = (spread[:-1].ravel() if turns is None else turned_back(turns, spread[:-1].ravel())) - tangent.matrix @ start
+    residual_start = turned_back(turns, spread[:-1].ravel()) - tangent.matrix @ start
     column, pressure = tangent.volume_column[kept], state.border[1] - balance.border[1]
     residual_start -= column * pressure
     volume_start = -float(column @ start + tangent.volume_pivot * pressure)
@@ -408,55 +403,3 @@ def update_friction(
     share = gap_before[left] / (gap_before[left] - gap[left])
     lost += float((limit_n[left] / 2 * share * np.linalg.norm(across, axis=1)).sum())
     return contact.anchor_mm, slid, limit, lost
-
-
-@compiled()
-def _move_points(local: IntArray, weights: FloatArray, at: FloatArray, y: FloatArray, T: FloatArray, yielded: float) -> FloatArray:
-    """Points (q, 3) in the object's frame after displacements ``y`` of their controls."""
-    controls = (len(y) - 2) // 3
-    out = np.empty_like(at)
-    for p in range(len(at)):
-        x0, x1, x2 = at[p, 0] - T[0, 3], at[p, 1] - T[1, 3], at[p, 2] - T[2, 3] - yielded
-        for a in range(9):
-            c = local[p, a]
-            if c < controls:
-                w = weights[p, a]
-                x0 += w * y[3 * c]
-                x1 += w * y[3 * c + 1]
-                x2 += w * y[3 * c + 2]
-        for i in range(3):
-            out[p, i] = x0 * T[0, i] + x1 * T[1, i] + x2 * T[2, i]
-    return out
-
-
-@compiled(fastmath=True)
-def _residual(linear: Triple, y: FloatArray, carried: tuple[IntArray, FloatArray, FloatArray], T: FloatArray, out: FloatArray) -> float:
-    """Write the residual forces on the near controls into ``out``; returns the sum of the contact forces along z. Sensor frame.
-
-    ``linear``: the forces' derivatives by the controls and by the pressure, and the forces at the start; ``carried``: the points' controls
-    and weights, and the contact forces in the object's frame.
-    """
-    (matrix, column, start), (local, weights, force) = linear, carried
-    count = len(y) - 2
-    for r in range(count):
-        total = start[r] + column[r] * y[count + 1]
-        for c in range(count):
-            total += matrix[r, c] * y[c]
-        out[r] = total
-    force_z = 0.0
-    for p in range(len(force)):
-        f0, f1, f2 = force[p, 0], force[p, 1], force[p, 2]
-        if f0 == 0 and f1 == 0 and f2 == 0:
-            continue
-        g0 = T[0, 0] * f0 + T[0, 1] * f1 + T[0, 2] * f2
-        g1 = T[1, 0] * f0 + T[1, 1] * f1 + T[1, 2] * f2
-        g2 = T[2, 0] * f0 + T[2, 1] * f1 + T[2, 2] * f2
-        force_z += g2
-        for a in range(9):
-            c = 3 * local[p, a]
-            if c < count:
-                w = weights[p, a]
-                out[c] -= w * g0
-                out[c + 1] -= w * g1
-                out[c + 2] -= w * g2
-    return force_z

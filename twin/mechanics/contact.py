@@ -88,7 +88,7 @@ def contact_points(solid: Solid, shape: SkinShape) -> ContactPoints:
     return ContactPoints(
         controls=solid.skin.controls[element, :9],
         weights=np.einsum("ri,cj->rcij", local, local).reshape(-1, 9),
-        lift_mm=shape.on_outside(flat) - flat,
+        lift_mm=np.ascontiguousarray(shape.on_outside(flat) - flat),
         area_mm2=np.linalg.norm(growth, axis=1) * step**2,
         element=element,
         place=solid.chart.disc(np.stack([np.tile(at, count), np.repeat(at, count)], axis=1)),

@@ -75,12 +75,9 @@ class ContactLaw:
 
     def override(self, *, friction: float | Friction | None = None, compliance_mm_per_n: float | None = None) -> "ContactLaw":
         """The same law with the given values in place of its own. A number for ``friction`` sets the static and the kinetic coefficient."""
-        law = self
-        if friction is not None:
-            law = replace(law, friction=friction if isinstance(friction, Friction) else Friction(friction, friction))
-        if compliance_mm_per_n is not None:
-            law = replace(law, compliance_mm_per_n=compliance_mm_per_n)
-        return law
+        both = friction if friction is None or isinstance(friction, Friction) else Friction(friction, friction)
+        yields = self.compliance_mm_per_n if compliance_mm_per_n is None else compliance_mm_per_n
+        return replace(self, friction=both or self.friction, compliance_mm_per_n=yields)
 
     def pose(self, T: np.ndarray, force_n: np.ndarray) -> np.ndarray:
         """Reached ``T_sensor_object`` (4, 4) under a force (3,) on the object, N, if ``T`` (4, 4) is commanded.

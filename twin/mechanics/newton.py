@@ -13,7 +13,7 @@ import numpy as np
 
 from twin.mechanics.balance import Balance, Body, LoadState, Problem, in_object
 from twin.mechanics.body.elements import Elements, KeptStiffness
-from twin.mechanics.body.linear import FrontalSolver, NotPositiveDefinite, whole
+from twin.mechanics.body.linear import FrontalSolver, NotPositiveDefinite
 from twin.mechanics.condensed import LARGEST_MOVE_MM, SmallContact, Tangent, first_touch, friction_substeps, substeps, update_friction
 from twin.mechanics.law import ContactLaw
 from twin.mechanics.path import carry_points
@@ -186,9 +186,8 @@ class LoadStepper:
         needed &= free
         if self._frontal is not None and not (needed & ~self._kept).any():
             return
-        kept = needed.copy()
-        kept[controls[gap < _PROVIDED_MM]] = True
-        self._kept = kept & free
+        needed[controls[gap < _PROVIDED_MM]] = True
+        self._kept = needed & free
         self._frontal = FrontalSolver([kind.cells.controls for kind in self._body.kinds], self._boxes, ~free, self._kept)
         self._local = np.where(self._kept, np.cumsum(self._kept) - 1, -1)[controls]
         self._tangent = None
@@ -287,7 +286,7 @@ class LoadStepper:
         blocks = [kept.blocks for kept in self._stiffness]
         while True:
             try:
-                matrix = frontal.eliminate(blocks, shift=shift)
+                lower = frontal.eliminate(blocks, shift=shift)
                 break
             except NotPositiveDefinite:
                 shift = max(_SHIFT_GROWTH * shift, _SMALLEST_SHIFT_N_MM)
@@ -297,8 +296,10 @@ class LoadStepper:
         if self._body.sealed:
             problem.volume(at.control_mm, column)
         column = frontal.forward(column[self._body.free].ravel())
-        inner, strains = frontal.inner(column), self._turns.strains(at.control_mm)
-        return Tangent(frontal, whole(matrix, shift), column, -float(inner @ inner), strains, self._local)
+        inner, strains = column[frontal.inner], self._turns.strains(at.control_mm)
+        matrix = lower + lower.T
+        np.fill_diagonal(matrix, lower.diagonal() + np.float32(shift))
+        return Tangent(frontal, matrix, column, -float(inner @ inner), strains, self._local)
 
     def _contact_move(
         self, problem: Problem, tangent: Tangent, balance: Balance, elastic: FloatArray, soften: bool
@@ -311,4 +312,4 @@ class LoadStepper:
         kept_move, border_move = small.solve(balance, soften=soften, least=0.1 * RESIDUAL_TOLERANCE)
         self.inner_iterations += small.iterations
         move = eliminated.backward(-(forward + border_move[1] * tangent.volume_column), kept_move)
-        return move if tangent.turns is None else turn_vectors(tangent.turns, move), border_move
+        return turn_vectors(tangent.turns, move), border_move

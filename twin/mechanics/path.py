@@ -118,22 +118,15 @@ class ContactPath:
         leg = int(np.clip(np.floor(progress), 0, len(self.poses) - 2))
         share = progress - leg
         start, stop = self.poses[leg], self.poses[leg + 1]
-        angle, once, twice = self._turns[leg]
         T = np.eye(4)
-        T[:3, :3] = start[:3, :3] + (np.sin(share * angle) * once + (1 - np.cos(share * angle)) * twice) @ start[:3, :3]
+        T[:3, :3] = Rotation.from_rotvec(share * self._turns[leg]).as_matrix() @ start[:3, :3]
         T[:3, 3] = (1 - share) * start[:3, 3] + share * stop[:3, 3]
         return T
 
     @cached_property
-    def _turns(self) -> list[tuple[float, FloatArray, FloatArray]]:
-        """For Rodrigues' formula, for each leg: angle, cross product with the axis as a matrix (3, 3), and this matrix squared."""
-        out = []
-        for way in Rotation.from_matrix(self.poses[1:, :3, :3] @ self.poses[:-1, :3, :3].transpose(0, 2, 1)).as_rotvec():
-            angle = float(np.linalg.norm(way))
-            x, y, z = way / max(angle, 1e-300)
-            once = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-            out.append((angle, once, once @ once))
-        return out
+    def _turns(self) -> FloatArray:
+        """Rotation vectors (k - 1, 3) of the legs."""
+        return Rotation.from_matrix(self.poses[1:, :3, :3] @ self.poses[:-1, :3, :3].transpose(0, 2, 1)).as_rotvec()
 
     def time_s(self, progress: float) -> float:
         """Time (s) at a progress from 0 to k - 1."""
@@ -168,12 +161,9 @@ def plan_path(geometry: GeometrySpec, field: ObjectField, pose: ContactPose) -> 
         If a value is out of range, or the object misses the skin or starts inside it.
     """
     _check(geometry, pose)
-    rx, ry = np.radians(pose.tilt_deg)
-    turn_x = np.array([[1, 0, 0], [0, np.cos(rx), -np.sin(rx)], [0, np.sin(rx), np.cos(rx)]])
-    turn_y = np.array([[np.cos(ry), 0, np.sin(ry)], [0, 1, 0], [-np.sin(ry), 0, np.cos(ry)]])
     skin, shape = geometry.skin, shape_of(geometry.skin)
     T = np.eye(4)
-    T[:3, :3] = turn_y @ turn_x
+    T[:3, :3] = Rotation.from_euler("xy", pose.tilt_deg, degrees=True).as_matrix()
     T[:3, 3] = [*pose.offset_mm, skin.apex_mm]
     size_mm = max(skin.half_size_mm)
 
@@ -199,8 +189,7 @@ def plan_path(geometry: GeometrySpec, field: ObjectField, pose: ContactPose) -> 
     poses = [T, pressed]
     if any(pose.shear_mm) or pose.twist_deg:
         move = np.eye(4)
-        angle = np.radians(pose.twist_deg)
-        move[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        move[:3, :3] = Rotation.from_euler("z", pose.twist_deg, degrees=True).as_matrix()
         move[:2, 3] = pose.shear_mm
         poses.append(move @ pressed)
     return ContactPath(np.stack(poses))

@@ -92,7 +92,7 @@ class SkinFit:
         solid = self._solid = build_solid(spec.geometry)
         self._kinds = soft_body(solid, spec.skin, spec.gel)
         self._free = np.flatnonzero(~solid.fixed)
-        unknown = np.full((len(solid.fixed), 3), -1)  # indices of each control's three unknowns; -1 where clamped
+        unknown = np.full((len(solid.fixed), 3), 3 * len(self._free))  # indices of each control's three unknowns; clamped: behind them
         unknown[self._free] = np.arange(3 * len(self._free)).reshape(-1, 3)
         self._entries = [_entries(unknown, kind.cells.controls) for kind in self._kinds]
         at, weights = (a.ravel() for a in solid.basis.gauss(2))
@@ -209,20 +209,20 @@ class SkinFit:
 
         If the tangent is not positive definite, its diagonal is shifted until it is.
         """
-        size = 3 * len(self._free)
+        size = 3 * len(self._free) + 1
         total = np.zeros(size * size)
-        for kind, (where, from_block) in zip(self._kinds, self._entries, strict=True):
+        for kind, where in zip(self._kinds, self._entries, strict=True):
             controls = kind.cells.controls
             block = np.zeros((len(controls), 6, controls.shape[1], controls.shape[1]))
             kind.stiffness(control_mm, 0.0, block)
-            total += np.bincount(where, block.ravel()[from_block], size * size)
-        matrix, shift = total.reshape(size, size).astype(np.float32), 0.0
+            total += np.bincount(where, block.ravel(), size * size)
+        matrix, shift = total.reshape(size, size)[:-1, :-1].astype(np.float32), 0.0
         while True:
             try:
                 return cho_factor(matrix, lower=True)
             except LinAlgError:
                 shift = 4 * shift or SHIFT_SHARE * float(np.mean(np.diag(matrix)))
-                matrix[np.diag_indices(size)] += shift
+                matrix[np.diag_indices(size - 1)] += shift
 
     def _move_controls(self, control_mm: FloatArray, move_mm: FloatArray) -> FloatArray:
         """The shape (n, 3) after a move (f, 3) of the free controls. The move is halved until no element is inside out."""
@@ -234,14 +234,13 @@ class SkinFit:
             move_mm = move_mm / 2
 
 
-def _entries(unknown: IntArray, controls: IntArray) -> tuple[IntArray, IntArray]:
-    """Map from the elements' stiffness blocks to the matrix: flat indices in its lower triangle, and the flat indices in the blocks."""
+def _entries(unknown: IntArray, controls: IntArray) -> IntArray:
+    """Flat indices of the entries of the stiffness blocks in the lower triangle of the matrix, whose last row takes the others."""
     m, b = controls.shape
     size = unknown.max() + 1
     where = np.empty((m, 6, b, b), np.int64)
     for p, (i, k) in enumerate(PAIRS):
         row, column = np.broadcast_arrays(unknown[controls, i][:, :, None], unknown[controls, k][:, None, :])
         low = np.maximum(row, column) * size + np.minimum(row, column)
-        where[:, p] = np.where((row < 0) | (column < 0) | ((i == k) & (row < column)), -1, low)
-    used = np.flatnonzero(where.ravel() >= 0)
-    return where.ravel()[used], used
+        where[:, p] = np.where((i == k) & (row < column), size * size - 1, low)
+    return where.ravel()

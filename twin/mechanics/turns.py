@@ -7,12 +7,11 @@ rotated back before the solution, and the solution is rotated forward.
 """
 
 import numpy as np
+from scipy.sparse import csr_array, vstack
 
-from twin.compiled import compiled
 from twin.geometry.solid import rotations
 from twin.mechanics.balance import Body
-from twin.mechanics.body.elements import deformation, gather
-from twin.types import FloatArray, IntArray
+from twin.types import FloatArray
 
 
 class Turns:
@@ -25,79 +24,44 @@ class Turns:
     """
 
     def __init__(self, body: Body) -> None:
-        self._kinds = [
-            (kind.cells.controls, kind.cells.gradients.mean(axis=1), (kind.law[0] + kind.law[1]) * kind.cells.weights_mm3.sum(axis=1))
-            for kind in body.kinds
-        ]
-        self._free = body.free
+        means, spreads, count = [], [], len(body.free)
+        for kind in body.kinds:
+            controls, gradients, weights = kind.cells
+            slopes, ends = gradients.mean(axis=1), np.arange(0, 3 * controls.size + 1, controls.shape[1])
+            means.append(csr_array((slopes.ravel(), np.repeat(controls, 3, axis=0).ravel(), ends), (3 * len(controls), count)))
+            stiff = (kind.law[0] + kind.law[1]) * np.repeat(weights.sum(axis=1), controls.shape[1])
+            spreads.append(csr_array((stiff, controls.ravel(), ends[: len(controls) + 1]), (len(controls), count)))
+        self._mean, self._spread = vstack(means).tocsr(), vstack(spreads).T.tocsr()[body.free]
 
-    def strains(self, control_mm: FloatArray) -> list[FloatArray]:
-        """Inverse of each element's mean deformation gradient, (m, 3, 3) for each kind of elements; ``since`` takes it."""
-        return [np.linalg.inv(_mean_gradient(controls, gradients, control_mm)) for controls, gradients, _ in self._kinds]
+    def strains(self, control_mm: FloatArray) -> FloatArray:
+        """Inverse of each element's mean deformation gradient, (m, 3, 3) for all elements; ``since`` takes it."""
+        return np.linalg.inv(self._gradients(control_mm))
 
-    def since(self, strains: list[FloatArray], control_mm: FloatArray) -> FloatArray:
+    def since(self, strains: FloatArray, control_mm: FloatArray) -> FloatArray:
         """Rotation of each free control since the state of ``strains``, (free, 3, 3)."""
-        total = np.zeros((len(control_mm), 3, 3))
-        for (controls, gradients, weights), old in zip(self._kinds, strains, strict=True):
-            _add_to_controls(controls, weights[:, None, None] * (_mean_gradient(controls, gradients, control_mm) @ old), total)
-        total = total[self._free]
+        total = (self._spread @ (self._gradients(control_mm) @ strains).reshape(-1, 9)).reshape(-1, 3, 3)
         return rotations(total * np.sqrt(3 / (total**2).sum(axis=(1, 2), keepdims=True)))
 
-
-@compiled(fastmath=True)
-def _mean_gradient(elements: IntArray, gradients: FloatArray, control: FloatArray) -> FloatArray:
-    """Mean deformation gradient of each element, (m, 3, 3)."""
-    out = np.empty((len(elements), 3, 3))
-    x = np.empty((3, elements.shape[1]))
-    for m in range(len(elements)):
-        gather(control, elements[m], x)
-        deformation(x, gradients[m], out[m])
-    return out
+    def _gradients(self, control_mm: FloatArray) -> FloatArray:
+        """Mean deformation gradient of each element, (m, 3, 3)."""
+        return (self._mean @ control_mm).reshape(-1, 3, 3).swapaxes(1, 2)
 
 
-@compiled(fastmath=True)
-def _add_to_controls(elements: IntArray, values: FloatArray, out: FloatArray) -> None:
-    """Add each element's matrix (m, 3, 3) to all of its controls."""
-    for m in range(len(elements)):
-        for a in range(elements.shape[1]):
-            total = out[elements[m, a]]
-            for i in range(3):
-                for j in range(3):
-                    total[i, j] += values[m, i, j]
+def turn_vectors(turns: FloatArray | None, vectors: FloatArray) -> FloatArray:
+    """Vectors (3 n,) of n controls, rotated by one rotation for each control (n, 3, 3); None: as they are."""
+    if turns is None:
+        return vectors
+    each = vectors.astype(turns.dtype, copy=False).reshape(-1, 3)  # einsum is slow for arrays of two types
+    return np.einsum("nij,nj->ni", turns, each).ravel().astype(vectors.dtype, copy=False)
 
 
-@compiled(fastmath=True)
-def turn_vectors(turns: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Vectors (3 n,) of n controls, rotated by one rotation for each control (n, 3, 3)."""
-    out = np.empty_like(vectors)
-    for n in range(len(turns)):
-        r = turns[n]
-        x, y, z = vectors[3 * n], vectors[3 * n + 1], vectors[3 * n + 2]
-        for i in range(3):
-            out[3 * n + i] = r[i, 0] * x + r[i, 1] * y + r[i, 2] * z
-    return out
-
-
-def turned_back(turns: FloatArray, vectors: FloatArray) -> FloatArray:
+def turned_back(turns: FloatArray | None, vectors: FloatArray) -> FloatArray:
     """The inverse of ``turn_vectors``."""
-    return turn_vectors(turns.transpose(0, 2, 1), vectors)
+    return turn_vectors(None if turns is None else turns.transpose(0, 2, 1), vectors)
 
 
 def turned_matrix(turns: FloatArray, matrix: FloatArray) -> FloatArray:
     """R M R^T for a symmetric matrix M (3 n, 3 n), where R has the rotations (n, 3, 3) as blocks on its diagonal."""
-    turns = turns.astype(matrix.dtype)
-    return _turned_rows(turns, _turned_rows(turns, matrix).T.copy())  # (R M)^T = M R^T by the symmetry of M
-
-
-@compiled(fastmath=True)
-def _turned_rows(turns: FloatArray, matrix: FloatArray) -> FloatArray:
-    """R M (see ``turned_matrix``)."""
-    out = np.empty_like(matrix)
-    for n in range(len(turns)):
-        a, b, c = matrix[3 * n], matrix[3 * n + 1], matrix[3 * n + 2]
-        for i in range(3):
-            r0, r1, r2 = turns[n, i, 0], turns[n, i, 1], turns[n, i, 2]
-            row = out[3 * n + i]
-            for k in range(len(matrix)):
-                row[k] = r0 * a[k] + r1 * b[k] + r2 * c[k]
-    return out
+    for _ in range(2):  # (R M)^T = M R^T by the symmetry of M
+        matrix = (turns.astype(matrix.dtype) @ matrix.reshape(len(turns), 3, len(matrix))).reshape(matrix.shape).T
+    return matrix

@@ -33,13 +33,9 @@ def _write(normal: FloatArray, hessian: FloatArray, k: int, n: Triple, a: Triple
     """Write point k's normal n and Hessian (I - n n - a a) / radius. Plain numbers are used, because slices of arrays would be slower."""
     normal[k, 0], normal[k, 1], normal[k, 2] = n
     if radius > _CREASE_MM:
-        r = 1 / radius
-        hessian[k, 0, 0] = r * (1 - n[0] * n[0] - a[0] * a[0])
-        hessian[k, 1, 1] = r * (1 - n[1] * n[1] - a[1] * a[1])
-        hessian[k, 2, 2] = r * (1 - n[2] * n[2] - a[2] * a[2])
-        hessian[k, 0, 1] = hessian[k, 1, 0] = -r * (n[0] * n[1] + a[0] * a[1])
-        hessian[k, 0, 2] = hessian[k, 2, 0] = -r * (n[0] * n[2] + a[0] * a[2])
-        hessian[k, 1, 2] = hessian[k, 2, 1] = -r * (n[1] * n[2] + a[1] * a[2])
+        for i in range(3):
+            for j in range(3):
+                hessian[k, i, j] = ((i == j) - n[i] * n[j] - a[i] * a[j]) / radius
 
 
 @compiled(error_model="numpy")

@@ -70,10 +70,8 @@ def unit_normals(slope: FloatArray, hessian: FloatArray) -> None:
         hy = h[1, 0] * x + h[1, 1] * y + h[1, 2] * z
         hz = h[2, 0] * x + h[2, 1] * y + h[2, 2] * z
         along = hx * x + hy * y + hz * z
-        h[0, 0] = (h[0, 0] - 2 * hx * x + along * x * x) / size
-        h[1, 1] = (h[1, 1] - 2 * hy * y + along * y * y) / size
-        h[2, 2] = (h[2, 2] - 2 * hz * z + along * z * z) / size
-        h[0, 1] = h[1, 0] = (h[0, 1] - hx * y - hy * x + along * x * y) / size
-        h[0, 2] = h[2, 0] = (h[0, 2] - hx * z - hz * x + along * x * z) / size
-        h[1, 2] = h[2, 1] = (h[1, 2] - hy * z - hz * y + along * y * z) / size
-        slope[k, 0], slope[k, 1], slope[k, 2] = x, y, z
+        n, bent = (x, y, z), (hx, hy, hz)
+        for i in range(3):
+            slope[k, i] = n[i]
+            for j in range(3):
+                h[i, j] = (h[i, j] - (bent[i] * n[j] + bent[j] * n[i]) + along * n[i] * n[j]) / size

@@ -49,32 +49,12 @@ _FINEST_MM = 0.25
 
 
 @compiled(error_model="numpy", fastmath=_SUMS)
-def _weights(t: float) -> Four:
-    """Weights of four nodes at the place ``t`` (0 to 1) between the second and the third."""
+def _basis(t: float) -> tuple[Four, Four, Four]:
+    """Weights of four nodes at the place ``t`` (0 to 1) between the second and the third: of the value, the slope and the bend."""
     s = 1 - t
-    return s**3 / 6, (4 - 6 * t**2 + 3 * t**3) / 6, (4 - 6 * s**2 + 3 * s**3) / 6, t**3 / 6
-
-
-@compiled(error_model="numpy", fastmath=_SUMS)
-def _slopes(t: float) -> Four:
-    s = 1 - t
-    return -(s**2) / 2, (3 * t - 4) * t / 2, (4 - 3 * s) * s / 2, t**2 / 2
-
-
-@compiled(error_model="numpy", fastmath=_SUMS)
-def _bends(t: float) -> Four:
-    return 1 - t, 3 * t - 2, 1 - 3 * t, t
-
-
-@compiled(error_model="numpy", fastmath=_SUMS)
-def _line(weights: Four, values: FloatArray, i: int, j: int, k: int) -> float:
-    """Weighted sum over four nodes along the last axis."""
-    return (
-        weights[0] * values[i, j, k]
-        + weights[1] * values[i, j, k + 1]
-        + weights[2] * values[i, j, k + 2]
-        + weights[3] * values[i, j, k + 3]
-    )
+    weights = s**3 / 6, (4 - 6 * t**2 + 3 * t**3) / 6, (4 - 6 * s**2 + 3 * s**3) / 6, t**3 / 6
+    slopes = -(s**2) / 2, (3 * t - 4) * t / 2, (4 - 3 * s) * s / 2, t**2 / 2
+    return weights, slopes, (1 - t, 3 * t - 2, 1 - 3 * t, t)
 
 
 @compiled(error_model="numpy", fastmath=_SUMS)
@@ -90,24 +70,6 @@ def _step_in(point: float, low: float, spacing: float, count: int) -> tuple[int,
 
 
 @compiled(error_model="numpy", fastmath=_SUMS)
-def spline_value(coefficients: FloatArray, corner: FloatArray, spacing: float, points: FloatArray) -> FloatArray:
-    """Values (k,) at points (k, 3). Outside the grid the distance to the grid is added."""
-    value = np.empty(len(points))
-    counts = coefficients.shape
-    for k in range(len(points)):
-        i, tx, away_x = _step_in(points[k, 0], corner[0], spacing, counts[0])
-        j, ty, away_y = _step_in(points[k, 1], corner[1], spacing, counts[1])
-        m, tz, away_z = _step_in(points[k, 2], corner[2], spacing, counts[2])
-        wx, wy, wz = _weights(tx), _weights(ty), _weights(tz)
-        f = np.sqrt(away_x * away_x + away_y * away_y + away_z * away_z)
-        for a in range(4):
-            for b in range(4):
-                f += wx[a] * wy[b] * _line(wz, coefficients, i - 1 + a, j - 1 + b, m - 1)
-        value[k] = f
-    return value
-
-
-@compiled(error_model="numpy", fastmath=_SUMS)
 def spline_probe(
     coefficients: FloatArray, corner: FloatArray, spacing: float, points: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -118,16 +80,15 @@ def spline_probe(
         i, tx, away_x = _step_in(points[k, 0], corner[0], spacing, counts[0])
         j, ty, away_y = _step_in(points[k, 1], corner[1], spacing, counts[1])
         m, tz, away_z = _step_in(points[k, 2], corner[2], spacing, counts[2])
-        wx, sx, bx = _weights(tx), _slopes(tx), _bends(tx)
-        wy, sy, by = _weights(ty), _slopes(ty), _bends(ty)
-        wz, sz, bz = _weights(tz), _slopes(tz), _bends(tz)
+        (wx, sx, bx), (wy, sy, by), (wz, sz, bz) = _basis(tx), _basis(ty), _basis(tz)
         f = fx = fy = fz = fxx = fxy = fxz = fyy = fyz = fzz = 0.0
         for a in range(4):
             g = gy = gz = gyy = gyz = gzz = 0.0  # summed over y and z
             for b in range(4):
-                h = _line(wz, coefficients, i - 1 + a, j - 1 + b, m - 1)
-                hz = _line(sz, coefficients, i - 1 + a, j - 1 + b, m - 1)
-                hzz = _line(bz, coefficients, i - 1 + a, j - 1 + b, m - 1)
+                h = hz = hzz = 0.0
+                for c in range(4):
+                    value_c = coefficients[i - 1 + a, j - 1 + b, m - 1 + c]
+                    h, hz, hzz = h + wz[c] * value_c, hz + sz[c] * value_c, hzz + bz[c] * value_c
                 g, gz, gzz = g + wy[b] * h, gz + wy[b] * hz, gzz + wy[b] * hzz
                 gy, gyz, gyy = gy + sy[b] * h, gyz + sy[b] * hz, gyy + by[b] * h
             f, fy, fz = f + wx[a] * g, fy + wx[a] * gy, fz + wx[a] * gz
@@ -183,9 +144,6 @@ class MeshField(Wrapped):
     spacing_mm: float
     coefficients: FloatArray
 
-    def distance(self, points_mm: FloatArray) -> FloatArray:
-        return spline_value(self.coefficients, self.corner_mm, self.spacing_mm, rows(points_mm))
-
     def probe(self, points_mm: FloatArray) -> Probe:
         distance, slope, hessian = spline_probe(self.coefficients, self.corner_mm, self.spacing_mm, rows(points_mm))
         unit_normals(slope, hessian)
@@ -239,8 +197,7 @@ def signed_distance(mesh: trimesh.Trimesh, points_mm: FloatArray) -> FloatArray:
 
 def sample_mesh(mesh: trimesh.Trimesh) -> MeshField:
     """Sample a placed mesh around the origin, as fine as ``_NODES`` allows."""
-    low = np.maximum(mesh.bounds[0], [-_REACH_MM, -_REACH_MM, -_REACH_MM]) - _MARGIN_MM
-    high = np.minimum(mesh.bounds[1], [_REACH_MM, _REACH_MM, _REACH_MM]) + _MARGIN_MM
+    low, high = np.clip(mesh.bounds, [[-_REACH_MM], [-np.inf]], [[np.inf], [_REACH_MM]]) + [[-_MARGIN_MM], [_MARGIN_MM]]
     spacing = max(_FINEST_MM, float(np.prod(high - low) / _NODES) ** (1 / 3))
     counts = np.ceil((high - low) / spacing).astype(int) + 1
     axes = [low[k] + spacing * np.arange(counts[k]) for k in range(3)]
@@ -258,10 +215,9 @@ def read_mesh(file: str, *, unit: str = "mm") -> trimesh.Trimesh:
         raise MeshError(f"{file}: no triangles in it; export a closed surface")
     mesh.apply_scale(_MM[unit])
     size_mm = float(mesh.extents.max())
-    if not np.isfinite(size_mm) or size_mm < _SMALLEST_MM:
-        raise MeshError(f"{file}: largest side is {size_mm:.3g} mm with unit = '{unit}': too small; {_UNIT_REMEDY}")
-    if size_mm > _LARGEST_MM:
-        raise MeshError(f"{file}: largest side is {size_mm:.3g} mm with unit = '{unit}': too large; {_UNIT_REMEDY}")
+    if not _SMALLEST_MM <= size_mm <= _LARGEST_MM:
+        wrong = "large" if size_mm > _LARGEST_MM else "small"
+        raise MeshError(f"{file}: largest side is {size_mm:.3g} mm with unit = '{unit}': too {wrong}; {_UNIT_REMEDY}")
     if not mesh.is_watertight:
         _, uses = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
         raise MeshError(
@@ -291,23 +247,15 @@ def place_mesh(mesh: trimesh.Trimesh, *, rotation_deg: tuple[float, float, float
     mesh.apply_transform(trimesh.transformations.euler_matrix(x, y, z, axes="rxyz"))
     middle = mesh.bounds.mean(axis=0)
     mesh.apply_translation([-middle[0], -middle[1], 0.0])
-    triangles = mesh.triangles
-    lowest = triangles[:, :, 2].min()
-    crossing = _heights_at_origin(triangles)
-    mesh.apply_translation([0.0, 0.0, -(crossing.min() if len(crossing) else lowest)])
+    crossing = _heights_at_origin(mesh.triangles)
+    mesh.apply_translation([0.0, 0.0, -(crossing.min() if len(crossing) else mesh.bounds[0, 2])])
     return mesh
 
 
 def _heights_at_origin(triangles: FloatArray) -> FloatArray:
     """z where the line x = y = 0 crosses the triangles (k, 3, 3)."""
-    a, b, c = triangles[:, 0, :2], triangles[:, 1, :2], triangles[:, 2, :2]
-
-    def cross(p: FloatArray, q: FloatArray) -> FloatArray:
-        return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
-
-    shares = np.stack([cross(b, c), cross(c, a), cross(a, b)], axis=1)
-    area = shares.sum(axis=1)
-    scale = np.abs(area) > 1e-12
-    shares = shares[scale] / area[scale, None]
+    flat = triangles * [1.0, 1.0, 0.0]
+    wide = trimesh.triangles.area(flat) > 5e-13
+    shares = trimesh.triangles.points_to_barycentric(flat[wide], np.zeros((wide.sum(), 3)), method="cross")
     hit = (shares >= -1e-9).all(axis=1)
-    return (shares[hit] * triangles[scale][hit][:, :, 2]).sum(axis=1)
+    return (shares[hit] * triangles[wide][hit][:, :, 2]).sum(axis=1)

@@ -1,26 +1,22 @@
 """The lights behind the window, and their light at places in the gel, in closed form and without shadows.
 
-LEDs are squares, and the bright ring is an annulus. All are flat and face +z. The ray equation is that of ``twin.camera.projection``.
+LEDs are squares, and the bright ring is an annulus. All are flat and face +z. The rays are those of `Window.connect`.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from types import ModuleType
 
 import numpy as np
 
-from scenes.body import GelSpec
-from scenes.sensor import HousingSpec, LedRingSpec, LensSpec
-from twin.compiled import compiled
-from twin.optics.glass import NEWTON_STEPS, fresnel
+from scenes.sensor import HousingSpec, LedRingSpec, SensorSpec
+from twin.optics.glass import NumPy, Window
+from twin.optics.variants.variant import DrJit
 from twin.types import FloatArray
 
 LED_FLUX = 640.0
 """Radiance times area (mm^2) of an LED of power 1. With it a white cap's radiance is about 1, the unit of the linear image."""
 RING_PLACES = 24
 """Number of point lights that approximate the housing's ring."""
-ON_AXIS_MM = 1e-4
-"""Distance from the vertical line through a light, below which a point is lit along this line."""
-_reflectance = compiled(error_model="numpy")(fresnel)
 
 
 @dataclass(frozen=True)
@@ -76,27 +72,18 @@ def lights(leds: LedRingSpec, ring: HousingSpec) -> list[Patch]:
 
 
 class DirectLight:
-    """Irradiance in the gel from all LEDs and the housing's ring. An LED is approximated by one point light, the ring by many.
+    """Irradiance in the gel from all LEDs and the housing's ring. An LED is approximated by one point light, the ring by many."""
 
-    Parameters
-    ----------
-    lens : LensSpec
-    gel : GelSpec
-    patches : sequence of Patch
-        The lights of the gel (see ``twin.optics.direct_light.lights``).
-    """
-
-    def __init__(self, lens: LensSpec, gel: GelSpec, patches: Sequence[Patch]) -> None:
-        self._window = np.array([lens.back_mm, lens.z_mm, lens.refractive_index, gel.refractive_index])
-        self._absorption = np.array(gel.absorption_per_mm, float)
-        places, powers = [], []
+    def __init__(self, spec: SensorSpec) -> None:
+        self._window, self._absorption = Window(spec.view), np.array(spec.gel.absorption_per_mm, float)
+        places, powers = [np.zeros((0, 3))], [np.zeros((0, 3))]
         turn = np.arange(RING_PLACES) * 2 * np.pi / RING_PLACES
-        for patch in patches:
+        for patch in lights(spec.leds, spec.housing):
             ring = 0 if patch.radii_mm[1] == 0 else np.sqrt(np.mean(patch.radii_mm**2))
             around = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1) if ring else np.zeros((1, 3))
             places.append(patch.center_mm + ring * around)
             powers.append(np.tile(patch.area_mm2 * patch.radiance / len(around), (len(around), 1)))
-        self._places, self._powers = np.concatenate(places or [np.zeros((0, 3))]), np.concatenate(powers or [np.zeros((0, 3))])
+        self._places, self._powers = np.concatenate(places), np.concatenate(powers) / self._window.gel_index**2
 
     def __call__(self, points_mm: FloatArray, normals: FloatArray, bump: float = 0.0) -> FloatArray:
         """Irradiance divided by n^2 of the gel. The radiance of a matt surface in air is ``albedo / pi`` times this.
@@ -115,73 +102,23 @@ class DirectLight:
         (n, 3) or (n, m, 3) float
             Linear RGB.
         """
-        each = normals.reshape(len(points_mm), -1, 3)
-        return _irradiance(points_mm, each, bump, self._places, self._powers, self._window, self._absorption).reshape(normals.shape)
+        toward, lengths, factor = self.refracted_rays(points_mm[:, None], self._places)
+        arriving = factor[..., None] * self._powers * np.exp(-self._absorption * lengths[..., None])
+        cosine = normals.reshape(len(points_mm), -1, 3) @ toward.swapaxes(1, 2)
+        return (received_share(NumPy, cosine, bump) @ arriving).reshape(normals.shape)
 
-    def refracted_rays(self, points_mm: FloatArray, place_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Refracted rays from points (n, 3) to a place (3,) in the air: unit directions (n, 3) and lengths (n,) in the gel."""
-        return _ways(points_mm, np.asarray(place_mm, float), self._window)
+    def refracted_rays(self, points_mm: FloatArray, places_mm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Refracted rays from points (..., 3) to places (..., 3) in the air, see `Window.connect`: directions, lengths, and factors."""
+        toward, lengths, factor = self._window.connect(NumPy, np.moveaxis(points_mm, -1, 0), np.moveaxis(places_mm, -1, 0))
+        return np.stack(toward, axis=-1), lengths, factor
 
-
-@compiled(error_model="numpy")
-def _irradiance(
-    points: FloatArray, normals: FloatArray, bump: float, places: FloatArray, powers: FloatArray, window: FloatArray, absorption: FloatArray
-) -> FloatArray:
-    result = np.zeros(normals.shape)
-    absorbs = np.any(absorption > 0)
-    for i in range(len(points)):
-        for k in range(len(places)):
-            x, y, z, length, factor = _refracted_ray(points[i], places[k], window)
-            arriving = factor * (powers[k] * np.exp(-absorption * length) if absorbs else powers[k])
-            for j in range(normals.shape[1]):
-                cosine = x * normals[i, j, 0] + y * normals[i, j, 1] + z * normals[i, j, 2]
-                if cosine > 0:
-                    for c in range(3):
-                        result[i, j, c] += ((1 - bump) * cosine + 0.5 * bump) * arriving[c]
-    return result
+    def transmittance(self, points_mm: FloatArray, place_mm: FloatArray) -> FloatArray:
+        """Transmittance (n, 3) of the gel from points (n, 3) to a place (3,) in the air."""
+        if not self._absorption.any():
+            return np.ones_like(points_mm)
+        return np.exp(-self._absorption * self.refracted_rays(points_mm, place_mm)[1][:, None])
 
 
-@compiled(error_model="numpy")
-def _ways(points: FloatArray, place: FloatArray, window: FloatArray) -> tuple[FloatArray, FloatArray]:
-    toward, lengths = np.empty((len(points), 3)), np.empty(len(points))
-    for i in range(len(points)):
-        toward[i, 0], toward[i, 1], toward[i, 2], lengths[i], _ = _refracted_ray(points[i], place, window)
-    return toward, lengths
-
-
-@compiled(error_model="numpy")
-def _refracted_ray(point: FloatArray, place: FloatArray, window: FloatArray) -> tuple[float, float, float, float, float]:
-    """The refracted ray from a point in the gel to a place in the air: direction and length in the gel, and a factor of the light.
-
-    The factor is the solid angle at the point (``d omega = sin d(theta) d(phi)``) per area at the place, whose normal is +z, times
-    the transmittance.
-    """
-    back, front, n_window, n_gel = window
-    air, glass, gel = back - place[2], front - back, point[2] - front
-    across_x, across_y = place[0] - point[0], place[1] - point[1]
-    rho = np.sqrt(across_x * across_x + across_y * across_y)
-    paraxial = 1 / (air + glass / n_window + gel / n_gel)
-    u, slope = rho * paraxial, 0.0
-    for step in range(NEWTON_STEPS + 1):
-        reach = air * u
-        slope = air
-        rest = 1 / np.sqrt(n_window**2 + (n_window**2 - 1) * u * u)
-        reach += glass * u * rest
-        slope += glass * n_window**2 * rest**3
-        rest = 1 / np.sqrt(n_gel**2 + (n_gel**2 - 1) * u * u)
-        reach += gel * u * rest
-        slope += gel * n_gel**2 * rest**3
-        if step < NEWTON_STEPS:
-            u = max(u + (rho - reach) / slope, 0.0)
-    cos_air = 1 / np.sqrt(1 + u * u)
-    sine = u * cos_air
-    sin_gel = sine / n_gel
-    cos_gel = np.sqrt(1 - sin_gel * sin_gel)
-    cos_window = np.sqrt(1 - (sine / n_window) ** 2)
-    sine_per_rho = sine / rho if rho > ON_AXIS_MM else paraxial
-    solid = sine_per_rho * cos_air**3 / (n_gel**2 * cos_gel * slope)
-    outer = _reflectance(1 / n_window, cos_air, cos_window)
-    inner = _reflectance(n_gel / n_window, cos_gel, cos_window)
-    through = (1 - outer) * (1 - inner) / (1 - outer * inner)
-    bend = sin_gel / rho if rho > ON_AXIS_MM else 0.0
-    return across_x * bend, across_y * bend, -cos_gel, gel / cos_gel, solid * through
+def received_share(dr: ModuleType | type[NumPy], cosine: DrJit, bump: DrJit) -> DrJit:
+    """Received share of light: by the cosine law of a flat place, mixed with that of a ball (one half, averaged over its visible side)."""
+    return dr.select(cosine > 0, (1 - bump) * cosine + 0.5 * bump, 0.0)

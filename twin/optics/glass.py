@@ -26,6 +26,22 @@ WIDEST_FISHEYE = 57.0
 """Largest tangent of a fisheye camera (89 deg off its axis)."""
 
 
+class NumPy:
+    """Dr.Jit's functions that `Window.connect` uses, for arrays."""
+
+    sqrt, maximum, select, rcp = np.sqrt, np.maximum, np.where, np.reciprocal
+
+    @staticmethod
+    def rsqrt(x: FloatArray) -> FloatArray:
+        """1 / sqrt(x)."""
+        return 1 / np.sqrt(x)
+
+    @staticmethod
+    def fma(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+        """a b + c."""
+        return a * b + c
+
+
 class Window:
     """The window of a sensor: planes (z, mm) and indices of air | window | gel."""
 
@@ -50,25 +66,33 @@ class Window:
         in_window = _refract(dr, mi, direction, 1 / self.window_index)
         place = place + in_window * ((self.front - self.back) / in_window.z)
         in_gel = _refract(dr, mi, in_window, self.window_index / self.gel_index)
-        return place, in_gel, self.transmittance(dr, direction.z, in_window.z, in_gel.z)
+        return place, in_gel, self.transmittance(direction.z, in_window.z, in_gel.z)
 
-    def connect(self, dr: ModuleType, mi: ModuleType, point: DrJit, light: DrJit) -> tuple[DrJit, DrJit, DrJit]:
+    def connect(self, dr: ModuleType | type[NumPy], point: DrJit, light: DrJit) -> tuple[DrJit, DrJit, DrJit]:
         """The refracted ray from points in the gel to points of a light in the air whose normal is +z.
+
+        Parameters
+        ----------
+        dr : module
+            Dr.Jit, or `NumPy` for arrays.
+        point, light : x, y and z
+            In the sensor frame, mm.
 
         Returns
         -------
-        toward : mi.Vector3f
+        toward : x, y and z
             Unit direction in the gel, from the point to the place at which the ray leaves the gel.
-        length : mi.Float
+        length
             Length of the ray in the gel, mm.
-        factor : mi.Float
+        factor
             Solid angle at the point per area of the light, times transmittance and n^2. Times the light's radiance in air and the
             cosine at the point, it is the irradiance per area of the light. Light from behind has the factor zero.
         """
-        across = mi.Vector2f(light.x - point.x, light.y - point.y)
-        rho2 = dr.squared_norm(across)
+        (x, y, z), (light_x, light_y, light_z) = point, light
+        across_x, across_y = light_x - x, light_y - y
+        rho2 = dr.fma(across_y, across_y, across_x * across_x)
         rho = dr.sqrt(dr.maximum(rho2, 1e-12))
-        layers = ((self.back - light.z, 1.0), (self.front - self.back, self.window_index), (point.z - self.front, self.gel_index))
+        layers = ((self.back - light_z, 1.0), (self.front - self.back, self.window_index), (z - self.front, self.gel_index))
         per_rho = dr.rcp(layers[0][0] + layers[1][0] / self.window_index + layers[2][0] / self.gel_index)
         u = rho * per_rho
         for _ in range(NEWTON_STEPS):
@@ -82,11 +106,10 @@ class Window:
         sine_per_rho = dr.select(rho2 > 1e-8, sine / rho, per_rho)
         # d omega = sin(gel) d(gel) d(phi),  d area = rho d(rho) d(phi),  cos(gel) d(gel) = cos_air^3 du / n
         solid = sine_per_rho * cos_air**3 / (self.gel_index**2 * cos_gel * slope)
-        toward = mi.Vector3f(across.x / rho * sin_gel, across.y / rho * sin_gel, -cos_gel)
-        factor = solid * self.transmittance(dr, cos_air, cos_window, cos_gel) * self.gel_index**2
-        return toward, (point.z - self.front) / cos_gel, factor
+        factor = solid * self.transmittance(cos_air, cos_window, cos_gel) * self.gel_index**2
+        return (across_x / rho * sin_gel, across_y / rho * sin_gel, -cos_gel), (z - self.front) / cos_gel, factor
 
-    def transmittance(self, dr: ModuleType, cos_air: DrJit, cos_window: DrJit, cos_gel: DrJit) -> DrJit:
+    def transmittance(self, cos_air: DrJit, cos_window: DrJit, cos_gel: DrJit) -> DrJit:
         """Transmittance of the slab for light that is unpolarised at each face, including multiple reflections within the slab."""
         outer, inner = fresnel(1 / self.window_index, cos_air, cos_window), self._inner_face(cos_gel, cos_window)
         return (1 - outer) * (1 - inner) / (1 - outer * inner)
@@ -126,7 +149,7 @@ def _refract(dr: ModuleType, mi: ModuleType, direction: DrJit, ratio: float) -> 
     return mi.Vector3f(x, y, dr.sqrt(dr.maximum(1 - x * x - y * y, 1e-8)))
 
 
-def _reach(dr: ModuleType, layers: tuple[tuple[DrJit, float], ...], u: DrJit) -> tuple[DrJit, DrJit]:
+def _reach(dr: ModuleType | type[NumPy], layers: tuple[tuple[DrJit, float], ...], u: DrJit) -> tuple[DrJit, DrJit]:
     reach, slope = 0.0, 0.0
     for height, n in layers:
         rest = dr.rsqrt(n * n + (n * n - 1) * u * u)

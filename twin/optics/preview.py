@@ -17,11 +17,10 @@ from scipy.spatial import Delaunay
 
 from scenes.sensor import GeometrySpec, SensorSpec, ViewSpec
 from twin.camera.projection import distort, project, sensor_to_camera, window_tangent
-from twin.compiled import compiled
 from twin.errors import RenderError
 from twin.geometry.pins import rest_pins
 from twin.geometry.shapes import shape_of
-from twin.optics.direct_light import DirectLight, lights
+from twin.optics.direct_light import DirectLight
 from twin.optics.glass import Window, ray_table
 from twin.optics.raster import PinOutlines, draw_pins, draw_triangles, side_normals
 from twin.optics.relief import Relief
@@ -44,8 +43,8 @@ NEAR_PX = 4.0
 """Standard deviation, px, of the Gaussian neighbourhood in which traced and rasterised light of the skin are compared."""
 MOST_SKIN_GAIN = 4.0
 """Largest gain of one corner of the skin."""
-LEAST_VARIANCE = 0.03
-"""Variance of the smallest blur that is not interpolated from a sharp picture, px^2: that of a disc of 0.7 px."""
+VARIANCES = 0.03 * np.append(0, 2.0 ** np.arange(24))
+"""Variances of the blurred pictures between which is interpolated, px^2. The smallest blur is that of a disc of 0.7 px."""
 FINE = 16
 """Number of points along each side of a pixel at which the coverage of the pixel by a disc is evaluated."""
 HALVINGS = 12
@@ -83,36 +82,12 @@ def defocused(image: FloatArray, circles: FloatArray) -> FloatArray:
     The result is interpolated between a few blurred pictures. The interpolation is linear in the variance of the blur, which is 1 / 16 of
     the squared diameter.
     """
-    first, last = int(_level(float(circles.min()))), int(np.ceil(_level(float(circles.max()))))
-    if last == 0:
-        return image
-    blurred = [cv2.filter2D(image, -1, disc(LEAST_VARIANCE * 2.0 ** (k - 1))) if k else image for k in range(first, last + 1)]
-    return np.asarray(_interpolate_blur(np.stack([each.reshape(image.shape) for each in blurred]), circles, first))
-
-
-@compiled()
-def _level(diameter_px: float) -> float:
-    """Fractional index of a blur among the blurred pictures. Their variances are 0, and 1, 2, 4, ... times ``LEAST_VARIANCE``."""
-    blur = diameter_px**2 / 16 / LEAST_VARIANCE
-    if blur < 1:
-        return blur
-    above = np.floor(np.log2(blur))
-    return above + blur / 2**above
-
-
-@compiled()
-def _interpolate_blur(blurred: FloatArray, circles: FloatArray, first: int) -> FloatArray:
-    """Picture (H, W, C) whose pixels have the given circles (H, W), from blurred pictures (K, H, W, C) with levels from ``first`` on."""
-    levels, height, width, channels = blurred.shape
-    found = np.empty((height, width, channels), np.float32)
-    for row in range(height):
-        for column in range(width):
-            at = _level(circles[row, column]) - first
-            low = min(int(at), levels - 1)
-            high = min(low + 1, levels - 1)
-            part = at - low
-            for k in range(channels):
-                found[row, column, k] = (1 - part) * blurred[low, row, column, k] + part * blurred[high, row, column, k]
+    level = np.interp(circles**2 / 16, VARIANCES, np.arange(len(VARIANCES))).astype(np.float32)
+    found = np.zeros_like(image)
+    for k in range(int(level.min()), int(np.ceil(level.max())) + 1):
+        blurred = cv2.filter2D(image, -1, disc(VARIANCES[k])) if k else image
+        share = cv2.merge([np.maximum(1 - np.abs(level - k), 0)] * image.shape[2])  # faster than a broadcast along the channels
+        found += (share * blurred.reshape(share.shape)).reshape(image.shape)
     return found
 
 
@@ -140,6 +115,49 @@ def _cover(diameter_px: float, reach: int) -> FloatArray:
     inside = np.clip(0.5 + FINE * (0.5 * diameter_px - np.hypot(place[:, None], place)), 0, 1)
     cover = inside.reshape(pixels, FINE, pixels, FINE).sum(axis=(1, 3)).astype(np.float32)
     return np.asarray(cover / cover.sum())
+
+
+class Film:
+    """What a window of the film gets besides the light of the smooth gel: the static layer and the relief.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+    window_px : (x0, y0, x1, y1)
+    static : (light, cover), optional
+        Static layer; by default the result of `static_layer`.
+
+    Attributes
+    ----------
+    shine : (H, W, C) float32
+        Light of the static layer; C is 3 for a color camera, else 1.
+    through : (H, W, 1) float32
+        Transmittance of the static layer for the gel's light.
+    """
+
+    def __init__(self, spec: SensorSpec, window_px: tuple[int, int, int, int], static: tuple[FloatArray, FloatArray] | None = None) -> None:
+        shine, cover = static_layer(spec, window_px) if static is None else static
+        self._mono = spec.camera.channels == "mono"
+        self._relief = None if spec.appearance.relief is None else Relief(spec, window_px)
+        size = window_px[3] - window_px[1], window_px[2] - window_px[0]
+        self.through = np.broadcast_to(1 - np.asarray(cover, np.float32), size)[..., None]
+        self.shine = self.channels(np.broadcast_to(shine, (*size, 3)))
+
+    def light(self, state: PinState) -> FloatArray:
+        """Light (H, W, C) of the static layer and the relief."""
+        known = self.shine.copy()
+        if self._relief is not None:
+            raised, more = self._relief.light(state)
+            known.reshape(-1, known.shape[2])[raised] += self.through.reshape(-1, 1)[raised] * self.channels(more)
+        return known
+
+    def channels(self, rgb: FloatArray) -> FloatArray:
+        """RGB (..., 3) as the film's channels (..., C)."""
+        return np.asarray(luminance(rgb)[..., None] if self._mono else rgb, np.float32)
+
+    def picture(self, light: FloatArray) -> FloatArray:
+        """Light (H, W, C), not below 0, as renderers give it: (H, W, 3) or (H, W)."""
+        return np.maximum(light[..., 0] if self._mono else light, 0)
 
 
 class Renders(Protocol):
@@ -222,14 +240,9 @@ class Preview:
     ) -> None:
         self.spec, self.shading = spec, shading or Shading()
         self.window_px = window_px or (0, 0, spec.camera.width_px, spec.camera.height_px)
-        self._color = spec.camera.channels == "color"
-        self._direct = DirectLight(spec.lens, spec.gel, lights(spec.leds, spec.housing))
-        shine, cover = static_layer(spec, self.window_px) if static is None else static
-        through = (1 - np.asarray(cover)) * _transmittance(spec.view, self.window_px)
-        self._through = through[..., None].astype(np.float32)
-        self._shine = self._on_film(np.broadcast_to(shine, (*through.shape, 3)))
-        self._relief = None if spec.appearance.relief is None else Relief(spec, self.window_px)
-        self._uncovered = (1 - np.asarray(cover)).ravel().astype(np.float32)
+        self._direct = DirectLight(spec)
+        self._film = Film(spec, self.window_px, static)
+        self._through = (self._film.through * _transmittance(spec.view, self.window_px)[..., None]).astype(np.float32)
         self._rest = rest_pins(spec.geometry)
         self._outlines = PinOutlines(spec.view, spec.pins, spec.appearance)
         self._belt_mm, self._faces = _belt(spec.geometry, self._rest.base_mm)
@@ -259,9 +272,7 @@ class Preview:
             The state has another number of pins.
         """
         state = self._rest if state is None else state
-        film = self._measured_light(state) + self._through * self._gel(self._drawing(state), self.shading)
-        np.maximum(film, 0, out=film)
-        return film if self._color else film[..., 0]
+        return self._film.picture(self._film.light(state) + self._through * self._gel(self._drawing(state), self.shading))
 
     def calibrate(self, renderer: Renders) -> Shading:
         """Fit the shading to a path-traced frame at rest, and use it for all following frames.
@@ -280,9 +291,9 @@ class Preview:
         """
         if renderer.window_px != self.window_px:
             raise RenderError(f"the renderer's window_px is {renderer.window_px}, the preview's {self.window_px}: build both alike")
-        traced = renderer.render().reshape(self._shine.shape)
+        traced = renderer.render().reshape(self._film.shine.shape)
         drawing = self._drawing(self._rest)
-        known = self._measured_light(self._rest)
+        known = self._film.light(self._rest)
         gel = traced - known
         # the weights depend on the rasterised light: with the noisy traced light, samples that are too dark would get too much weight;
         # traced light below 0 was set to 0, so it has no weight
@@ -294,15 +305,6 @@ class Preview:
         fit = Shading(*np.stack(fitted, axis=-1).reshape(2, 4, -1))
         self.shading = replace(fit, skin=self._skin_gain(drawing, fit, np.where(traced > 0, gel, np.nan)))
         return self.shading
-
-    def _measured_light(self, state: PinState) -> FloatArray:
-        """Light (H, W, C) of the static layer and the measured relief."""
-        if self._relief is None:
-            return self._shine
-        known = self._shine.copy()
-        raised, more = self._relief.light(state)
-        known.reshape(-1, known.shape[2])[raised] += self._uncovered[raised, None] * self._on_film(more)
-        return known
 
     def _skin_gain(self, drawing: _Drawing, fit: Shading, gel: FloatArray) -> FloatArray:
         """Gain (v, 1) of each corner of the skin: ratio of traced light (H, W, C) to the fit's, in its neighbourhood without pins.
@@ -325,14 +327,14 @@ class Preview:
         if base.shape != self._rest.base_mm.shape:
             raise RenderError(f"the state has {len(base)} pins, {self.spec.name} has {len(self._rest.base_mm)}")
         pupil = np.array([0.0, 0.0, -self.spec.camera.distance_mm])
-        toward, _ = self._direct.refracted_rays(caps, pupil)
+        toward, _, _ = self._direct.refracted_rays(caps, pupil)
         half = 0.5 * self.spec.pins.cap_height_mm
         places = [base, 0.5 * (base + caps), caps, caps + half * axis]
         side = toward - np.sum(toward * axis, axis=1, keepdims=True) * axis
         normals, bump = (axis, unit(side), side_normals(axis), axis), self.spec.appearance.cap_bump
         lit = [self._direct(*each) for each in zip(places, normals, (0.0, 0.0, bump, bump), strict=True)]
         skin = np.concatenate([base, self._belt_mm])
-        kept = [self._gel_transmittance(place, pupil) for place in (skin, *places[1:])]
+        kept = [self._direct.transmittance(place, pupil) for place in (skin, *places[1:])]
         kept[SIDE] = kept[SIDE][:, None]
         direct = [light * share for light, share in zip([np.concatenate([lit[0], self._belt_light]), *lit[1:]], kept, strict=True)]
         feet_px, outlines_px = self._outlines(base, axis, caps)
@@ -346,11 +348,11 @@ class Preview:
 
     def _gel(self, drawing: _Drawing, shading: Shading) -> FloatArray:
         """Light (H, W, C) of skin and pins before it passes the window."""
-        image = np.zeros(self._shine.shape, np.float32)
+        image = np.zeros(self._film.shine.shape, np.float32)
         offset = shading.offset * self._mean_light
         parts = zip(self._albedo, shading.gain, drawing.direct, offset, drawing.ambient, strict=True)
         skin, stem, side, face = (
-            self._on_film(albedo / np.pi * (gain * direct + more * ambient)) for albedo, gain, direct, more, ambient in parts
+            self._film.channels(albedo / np.pi * (gain * direct + more * ambient)) for albedo, gain, direct, more, ambient in parts
         )
         draw_triangles(image, drawing.corners_px, skin * shading.skin.astype(np.float32), self._faces)
         draw_pins(image, drawing.outlines_px, (stem, side, face), drawing.facing, drawing.far_first)
@@ -359,17 +361,6 @@ class Preview:
         circles = np.zeros((*image.shape[:2], 1), np.float32)
         draw_triangles(circles, drawing.corners_px, drawing.circles, self._faces)
         return defocused(image, circles[..., 0])
-
-    def _gel_transmittance(self, points_mm: FloatArray, pupil_mm: FloatArray) -> FloatArray:
-        """Transmittance (n, 3) of the gel from points (n, 3) to the camera."""
-        absorption = np.array(self.spec.gel.absorption_per_mm)
-        if not absorption.any():
-            return np.ones_like(points_mm)
-        return np.exp(-absorption * self._direct.refracted_rays(points_mm, pupil_mm)[1][:, None])
-
-    def _on_film(self, rgb: FloatArray) -> FloatArray:
-        """RGB (..., 3) as the film's channels (..., C)."""
-        return np.asarray(rgb if self._color else luminance(rgb)[..., None], np.float32)
 
 
 def _fit_gains(parts: FloatArray, target: FloatArray) -> FloatArray:
@@ -396,4 +387,4 @@ def _transmittance(view: ViewSpec, window_px: tuple[int, int, int, int]) -> Floa
     corners = (ray_table(view.camera, window_px) @ sensor_to_camera(view.camera)[:3, :3])[..., 2]
     cos_air = np.clip(0.25 * (corners[:-1, :-1] + corners[1:, :-1] + corners[:-1, 1:] + corners[1:, 1:]), 1e-6, 1)
     cos_window, cos_gel = (np.sqrt(1 - (1 - cos_air**2) / n**2) for n in (view.lens.refractive_index, view.gel_index))
-    return Window(view).transmittance(np, cos_air, cos_window, cos_gel)
+    return Window(view).transmittance(cos_air, cos_window, cos_gel)

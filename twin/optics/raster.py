@@ -9,7 +9,7 @@ import numpy as np
 from scenes.sensor import AppearanceSpec, PinsSpec, ViewSpec
 from twin.camera.projection import project
 from twin.compiled import compiled
-from twin.geometry.pins import across_axis
+from twin.geometry.pins import around_axis
 from twin.optics.surfaces import CAP_BEVEL, STEM_SIDES, cap_outlines
 from twin.types import BoolArray, FloatArray, IntArray
 
@@ -49,7 +49,7 @@ class PinOutlines:
         pins = self._pins
         radius, half = 0.5 * pins.cap_diameter_mm, 0.5 * pins.cap_height_mm
         bevel = min(CAP_BEVEL * pins.cap_height_mm, 0.5 * radius)
-        rim = caps_mm + radius * np.moveaxis(_around(axis, np.arange(RIM_PLACES) * 2 * np.pi / RIM_PLACES), 1, 0)
+        rim = caps_mm + radius * np.moveaxis(around_axis(axis, np.arange(RIM_PLACES) * 2 * np.pi / RIM_PLACES), 1, 0)
         seen = project(self._view, np.concatenate([rim, caps_mm[None], base_mm[None]]))
         centre, foot = seen[-2, :, None], seen[-1, :, None]
         from_centre = seen[:-2] - seen[-2]
@@ -67,14 +67,8 @@ class PinOutlines:
 
 def side_normals(axis: FloatArray) -> FloatArray:
     """Outward unit normals (N, 2 SIDES, 3) of the facets of the caps' walls, then of their bevels, about axes (N, 3)."""
-    wall = _around(axis, TURN + np.pi / SIDES)
+    wall = around_axis(axis, TURN + np.pi / SIDES)
     return np.concatenate([wall, np.sqrt(0.5) * (wall + axis[:, None])], axis=1)
-
-
-def _around(axis: FloatArray, turn: FloatArray) -> FloatArray:
-    """Unit vectors (N, k, 3) perpendicular to axes (N, 3) at azimuths (k,), which start at the sensor's x (as `surfaces` does)."""
-    u, v = across_axis(axis)
-    return np.cos(turn)[:, None] * u[:, None] + np.sin(turn)[:, None] * v[:, None]
 
 
 def _hull(near: FloatArray, far: FloatArray) -> FloatArray:
@@ -109,7 +103,7 @@ def draw_pins(
     """
     height, width, channels = image.shape
     sides, (stem_light, side_light, face_light) = outlines.shape[2], lights
-    quad, black = np.empty((4, 2)), np.zeros(channels)
+    quad, black = np.empty((4, 2)), np.zeros(channels, np.float32)
     for p in order:
         for body in range(2):
             shapes = outlines[p, 1:] if body else outlines[p, :1]

@@ -15,7 +15,7 @@ from twin.camera.projection import project
 from twin.compiled import compiled
 from twin.errors import FrameError, RenderError
 from twin.geometry.pins import across_axis
-from twin.optics.direct_light import DirectLight, lights
+from twin.optics.direct_light import DirectLight
 from twin.optics.static_layer import values_of
 from twin.optics.surfaces import cap_albedo
 from twin.types import FloatArray, IntArray, PinState
@@ -123,7 +123,7 @@ class CapLamp:
     """Radiance (N, 3) that each smooth cap sends to the camera, in the renderer's unit, without shadows: tiles are relative to it."""
 
     def __init__(self, spec: SensorSpec) -> None:
-        self._lamp, self._bump = DirectLight(spec.lens, spec.gel, lights(spec.leds, spec.housing)), spec.appearance.cap_bump
+        self._lamp, self._bump = DirectLight(spec), spec.appearance.cap_bump
         self._albedo = cap_albedo(spec.appearance, spec.pins.count)
 
     def __call__(self, state: PinState) -> FloatArray:

@@ -12,12 +12,9 @@ from twin.errors import RenderError
 from twin.geometry.mesh import SensorMesh
 from twin.geometry.pins import rest_pins
 from twin.optics.glass import CameraRays, Window
-from twin.optics.preview import Preview, Shading
-from twin.optics.relief import Relief
+from twin.optics.preview import Film, Preview, Shading
 from twin.optics.sampling import SKIN_SAVING, PixelSamples, near_pins
-from twin.optics.scalar import ScalarView
-from twin.optics.scene import build_scene, move_meshes
-from twin.optics.static_layer import static_layer
+from twin.optics.scene import ScalarView, build_scene, move_meshes
 from twin.optics.surfaces import PaintedSurface, SkinSurface, caps, stems
 from twin.optics.tracer import GelTracer, luminance
 from twin.optics.variants.variant import DrJit, VariantChoice, choose_variant, use_variant, with_room
@@ -119,15 +116,14 @@ class Renderer:
         return SkinSurface(self.spec.skin, self._rest.base_mm if self._mesh is None else self._mesh.nodes_mm[self._inner])
 
     @cached_property
-    def _relief(self) -> Relief | None:
-        return None if self.spec.appearance.relief is None else Relief(self.spec, self.window_px)
+    def film(self) -> Film:
+        """What the film gets besides the light of the smooth gel."""
+        return Film(self.spec, self.window_px)
 
-    @cached_property
+    @property
     def static(self) -> tuple[FloatArray, FloatArray]:
-        """Light (H, W, 3) or (H, W) of the static layer, and its transmittance (H, W) for the gel's light."""
-        light, cover = static_layer(self.spec, self.window_px)
-        mono = self.spec.camera.channels == "mono"
-        return (luminance(light).astype(np.float32) if mono else light), 1 - cover
+        """Light (H, W, C) of the static layer, and its transmittance (H, W) for the gel's light."""
+        return self.film.shine, self.film.through[..., 0]
 
     def render(self, state: PinState | None = None, seed: int = 0) -> FloatArray:
         """Linear light on the film.
@@ -178,23 +174,15 @@ class Renderer:
             self._view = kind(mi, self.spec, self.window_px, surfaces, self._bounces)
         else:
             move_meshes(self._view.params, surfaces)
-        light, through = self.static
-        pixels = np.flatnonzero(through > 0)
-        known = light.copy()
-        if self._relief is not None:
-            raised, more = self._relief.light(state)
-            more = luminance(more)[:, None] if light.ndim == 2 else more
-            known.reshape(through.size, -1)[raised] += through.ravel()[raised, None] * more
-        total: FloatArray = np.zeros((1, 1))
-        count = 0
+        known, through = self.film.light(state), self.film.through.reshape(-1, 1)
+        pixels = np.flatnonzero(through)
+        total, count = np.zeros((1, 1)), 0
         for k, spp in enumerate(samples):
             gel = self._view.gel_light(pixels, spp, seed + k * PASS_SEED, state)
-            if light.ndim == 2 and gel.shape[1] == 3:
-                gel = luminance(gel)[:, None]
-            total, count = total + spp * gel, count + spp
+            total, count = total + spp * (gel if gel.shape[1] == known.shape[2] else luminance(gel)[:, None]), count + spp
             image = known.copy()
-            image.reshape(through.size, -1)[pixels] += (through.ravel()[pixels, None] * (total / count)).astype(np.float32)
-            yield np.maximum(image, 0)
+            image.reshape(len(through), -1)[pixels] += (through[pixels] * (total / count)).astype(np.float32)
+            yield self.film.picture(image)
 
     def surfaces(self, state: PinState) -> dict[str, PaintedSurface]:
         """Skin, stems and caps of a state, by the names of the scene's meshes.

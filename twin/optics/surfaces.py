@@ -11,7 +11,7 @@ from scipy.interpolate import RBFInterpolator
 
 from scenes.body import SkinSpec
 from scenes.sensor import AppearanceSpec, PinsSpec
-from twin.geometry.pins import across_axis
+from twin.geometry.pins import around_axis
 from twin.geometry.shapes import shape_of
 from twin.types import FloatArray, IntArray
 
@@ -80,8 +80,7 @@ class SkinSurface:
 
 def stems(pins: PinsSpec, base_mm: FloatArray, axis: FloatArray) -> PaintedSurface:
     """All pin stems as one surface: cylinders from the skin to the cap."""
-    length = pins.length_mm
-    profile = np.array([[0.5 * pins.diameter_mm, -STEM_ROOT_MM], [0.5 * pins.diameter_mm, length]])
+    profile = np.array([[0.5 * pins.diameter_mm, -STEM_ROOT_MM], [0.5 * pins.diameter_mm, pins.length_mm]])
     return lathe(profile, base_mm, axis, STEM_SIDES)
 
 
@@ -154,9 +153,7 @@ def lathe(profile: FloatArray, origin_mm: FloatArray, axis: FloatArray, sides: i
     The azimuth starts at the projection of the sensor's x onto the body's plane and increases towards y. ``outlines`` (N, sides) scale
     the radius.
     """
-    u, v = across_axis(axis)
-    turn = np.arange(sides) * 2 * np.pi / sides
-    circle = np.cos(turn)[None, :, None] * u[:, None] + np.sin(turn)[None, :, None] * v[:, None]
+    circle = around_axis(axis, np.arange(sides) * 2 * np.pi / sides)
     if outlines is not None:
         circle = circle * outlines[:, :, None]
     body = profile[None, :, None, :1] * circle[:, None] + profile[None, :, None, 1:] * axis[:, None, None]

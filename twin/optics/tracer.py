@@ -10,7 +10,7 @@ from types import ModuleType
 import numpy as np
 
 from scenes.sensor import SensorSpec
-from twin.optics.direct_light import Patch, lights
+from twin.optics.direct_light import Patch, lights, received_share
 from twin.optics.glass import Window
 from twin.optics.sampling import PixelSamples
 from twin.optics.variants.variant import DrJit
@@ -114,9 +114,10 @@ class GelTracer:
         total = mi.Float(0.0)
         bump = dr.select(hit.shape == self._caps, self._bump, 0.0)
         for patch, radiance in zip(self.patches, self.radiances, strict=True):
-            toward, length, factor = self.window.connect(dr, mi, hit.p, _point(mi, dr, patch, place))
+            way, length, factor = self.window.connect(dr, hit.p, _point(mi, dr, patch, place))
+            toward = mi.Vector3f(*way)
             ways.append((toward, length, factor * patch.area_mm2 * radiance))
-            taken = _received_share(dr, dr.dot(toward, hit.sh_frame.n), bump)
+            taken = received_share(dr, dr.dot(toward, hit.sh_frame.n), bump)
             strength = dr.detach(dr.max(radiance)) * factor * patch.area_mm2 * taken
             total += dr.select(active, strength, 0.0)
             shares.append(mi.Float(total))
@@ -134,7 +135,7 @@ class GelTracer:
         shadow.maxt = length * (1 - 1e-4)
         lit &= ~self.scene.ray_test(shadow, coherent=False, active=lit)
         local = hit.to_local(toward)
-        reflected = bsdf.eval(mi.BSDFContext(), hit, local, lit) * (_received_share(dr, local.z, bump) / dr.maximum(local.z, NEVER))
+        reflected = bsdf.eval(mi.BSDFContext(), hit, local, lit) * (received_share(dr, local.z, bump) / dr.maximum(local.z, NEVER))
         arriving *= self._transmittance(mi, dr, length, lit) * self._tint(mi, dr, hit)
         return dr.select(lit, reflected * arriving * (total / dr.maximum(share, NEVER)), 0.0)
 
@@ -148,11 +149,6 @@ class GelTracer:
         if not any(self._absorption):
             return mi.Spectrum(1.0)
         return dr.exp(-spectrum(mi, np.array(self._absorption)) * dr.select(active, length, 0.0))
-
-
-def _received_share(dr: ModuleType, cosine: DrJit, bump: DrJit) -> DrJit:
-    """Received share of light: by the cosine law of a flat place, mixed with that of a ball (one half, averaged over its visible side)."""
-    return dr.select(cosine > 0, (1 - bump) * cosine + 0.5 * bump, 0.0)
 
 
 def spectrum(mi: ModuleType, rgb: FloatArray) -> DrJit:

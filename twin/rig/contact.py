@@ -14,10 +14,9 @@ When an arm presses a sensor against an object with the force F (on the object, 
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
-from math import cos, radians, sin
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
@@ -51,18 +50,9 @@ class ArmTurning:
     tool_mm: np.ndarray
     deg_per_n: float
 
-    @cached_property
-    def _cross(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Three matrices (3, 3) for Rodrigues' formula: the identity, the cross product with the axis, and its square."""
-        x, y, z = self.axis
-        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        return np.eye(3), cross, cross @ cross
-
     def __call__(self, T: np.ndarray, force_n: np.ndarray) -> np.ndarray:
         """The object's pose (4, 4) under a force (3,), N. In the sensor frame it rotates about the tool point, opposite to the tool."""
-        angle = -radians(self.deg_per_n * float(self.across @ force_n))
-        one, cross, squared = self._cross
-        turn = one + sin(angle) * cross + (1 - cos(angle)) * squared
+        turn = Rotation.from_rotvec(-self.deg_per_n * (self.across @ force_n) * self.axis, degrees=True).as_matrix()
         there = T.copy()
         there[:3, :3] = turn @ T[:3, :3]
         there[:3, 3] = self.tool_mm + turn @ (T[:3, 3] - self.tool_mm)

@@ -35,8 +35,8 @@ MOST_TURN_DEG = 1.0  # largest rotation between two poses of the path; its strai
 CLEAR_MM = 10.0  # length by which the search extends the start of the tap; recorded taps of 5 mm begin up to 0.4 mm inside the object
 
 TURNING = {"x": 5, "y": 5, "z": 4}  # by approach: index of the label that rotates the tool in the plane of approach and across
-_DIRECTIONS = {"x": ((1, 0, 0), (0, 1, 0)), "y": ((0, 1, 0), (1, 0, 0)), "z": ((0, 0, 1), (1, 0, 0))}  # approach, across
-_SENSOR_AXIS = np.array([0.0, 0.0, 1.0])  # in the sensor frame
+_WORK_AXES = {"x": [[0, 0, 1], [1, 0, 0], [0, 1, 0]], "y": [[1, 0, 0], [0, 0, 1], [0, -1, 0]], "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}
+"""By approach: the directions across, approach x across, and approach, as columns in the work frame."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,8 @@ class Mounting:
         The sensor's z (out of the skin's apex) in the tool frame.
     across : (3,) float
         Direction in the tool frame along which the tool is fed; it is perpendicular to the axis.
+    work_axes : (3, 3) float
+        Axes of the frame in which tasks and policies move a tool, as columns in the tool frame: x ``across``, z ``axis``.
     image_turn_deg : float
         Azimuth of ``across`` in the sensor frame, from image x towards image y.
     centre_mm : (3,) float
@@ -102,9 +104,9 @@ class Mounting:
     """
 
     def __init__(self, rig: RigSpec, experiment: ExperimentSpec, skin: SkinSpec) -> None:
-        self.axis, self.across = axis, across = np.array(_DIRECTIONS[experiment.approach], float)
-        self.image_turn_deg = rig.image_turn_deg
-        self.centre_mm = rig.tcp_to_dome_mm * axis + rig.tcp_lateral_mm * across + rig.tcp_binormal_mm * np.cross(axis, across)
+        self.work_axes, self.image_turn_deg = np.array(_WORK_AXES[experiment.approach], float), rig.image_turn_deg
+        self.across, _, self.axis = self.work_axes.T
+        self.centre_mm = self.work_axes @ [rig.tcp_lateral_mm, rig.tcp_binormal_mm, rig.tcp_to_dome_mm]
         self.skin_apex_mm, self.skin_reach_mm = skin.apex_mm, max(skin.apex_mm, *skin.half_size_mm)
         about = TURNING[experiment.approach] - 3
         self.depth_label, self.angle_label = f"pose_{experiment.axis + 1}", f"pose_{about + 4}"
@@ -125,36 +127,25 @@ class Mounting:
     @property
     def across_in_sensor(self) -> np.ndarray:
         """``across`` (3,) in the sensor frame."""
-        return np.array([np.cos(np.radians(self.image_turn_deg)), np.sin(np.radians(self.image_turn_deg)), 0.0])
+        return Rotation.from_euler("z", self.image_turn_deg, degrees=True).as_matrix()[:, 0]
 
     @property
     def tool_point_mm(self) -> np.ndarray:
         """The tool point (3,) in the sensor frame."""
-        frame = np.stack([self.axis, self.across, np.cross(self.axis, self.across)])
-        here = np.stack([_SENSOR_AXIS, self.across_in_sensor, np.cross(_SENSOR_AXIS, self.across_in_sensor)])
-        return -(frame @ self.centre_mm) @ here
-
-    @property
-    def work_axes(self) -> np.ndarray:
-        """Axes (3, 3) of the frame in which tasks and policies move a tool, as columns in the tool frame: x ``across``, z ``axis``."""
-        return np.column_stack([self.across, np.cross(self.axis, self.across), self.axis])
+        return -self.centre_mm @ self.T_tool_sensor[:3, :3]
 
     @property
     def T_tool_sensor(self) -> np.ndarray:
         """Pose (4, 4) of the sensor frame in the tool frame, mm."""
-        turn = np.radians(self.image_turn_deg)
-        side = np.cross(self.axis, self.across)  # direction whose azimuth in the sensor frame is 90 deg larger than that of ``across``
         T = np.eye(4)
-        T[:3, 0] = np.cos(turn) * self.across - np.sin(turn) * side
-        T[:3, 1] = np.sin(turn) * self.across + np.cos(turn) * side
-        T[:3, 2] = self.axis
+        T[:3, :3] = self.work_axes @ Rotation.from_euler("z", -self.image_turn_deg, degrees=True).as_matrix()
         T[:3, 3] = self.centre_mm
         return T
 
     @property
     def label_turn(self) -> np.ndarray:
         """Axis (3,) in the sensor frame about which the tool rotates, right-handed, when the label of the angle increases."""
-        return self.angle_sign * np.cross(self.across_in_sensor, _SENSOR_AXIS)
+        return self.angle_sign * np.cross(self.across_in_sensor, [0.0, 0.0, 1.0])
 
     @classmethod
     def of(cls, sensor: SensorSpec, experiment: ExperimentSpec) -> "Mounting":
@@ -176,20 +167,16 @@ class Mounting:
 
 def object_pose(rig: RigSpec, experiment: ExperimentSpec, pose: np.ndarray, apex_mm: float) -> np.ndarray:
     """``T_sensor_object`` (4, 4) for a pose (6,) of the arm in mm and deg; ``apex_mm`` is the z of the skin's apex."""
-    axis, across = np.array(_DIRECTIONS[experiment.approach], float)
-    unturned = np.column_stack([across, np.cross(axis, across), axis])  # the sensor's x, y and z in the work frame
+    unturned = np.array(_WORK_AXES[experiment.approach], float)  # the sensor's x, y and z in the work frame
     turn = tool_turn(rig, pose)
     centre = pose[:3] + turn @ unturned @ [rig.tcp_lateral_mm, rig.tcp_binormal_mm, rig.tcp_to_dome_mm]
     height_mm = apex_mm + rig.tcp_to_dome_mm - experiment.zero_mm - rig.contact_offset_mm
     surface = unturned @ [*rig.object_shift_mm, height_mm]
-    sensor = turn @ unturned
+    to_sensor = Rotation.from_euler("z", rig.image_turn_deg, degrees=True).as_matrix() @ (turn @ unturned).T
     T = np.eye(4)
-    stands = Rotation.from_euler("y", -rig.plate_tilt_deg, degrees=True) * Rotation.from_euler("z", rig.object_turn_deg, degrees=True)
-    T[:3, :3] = sensor.T @ unturned @ stands.as_matrix()
-    T[:3, 3] = sensor.T @ (surface - centre)
-    in_image = np.eye(4)
-    in_image[:3, :3] = Rotation.from_euler("z", rig.image_turn_deg, degrees=True).as_matrix()
-    return in_image @ T
+    T[:3, :3] = to_sensor @ unturned @ Rotation.from_euler("zy", [rig.object_turn_deg, -rig.plate_tilt_deg], degrees=True).as_matrix()
+    T[:3, 3] = to_sensor @ (surface - centre)
+    return T
 
 
 def tool_turn(rig: RigSpec, pose: np.ndarray) -> np.ndarray:

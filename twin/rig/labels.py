@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scenes.experiment import ExperimentSpec
+from scenes.experiment import LABELS, ExperimentSpec
 from scenes.rig import RigSpec
 from twin.errors import FrameError
 from twin.frames import Recording
@@ -57,8 +57,7 @@ def read_arm_labels(recording: Recording, experiment: ExperimentSpec | None = No
         If there is no table, if it has no column of a pose or lacks one that the experiment varies, or if a cell of a pose or move is not a
         number.
     """
-    names = [f"{kind}_{axis}" for kind in ("pose", "move") for axis in range(1, 7)]
-    if not any(name in recording.labels for name in names[:6]):
+    if not any(name in recording.labels for name in LABELS[:6]):
         found = recording.labels_found()
         raise FrameError(f"{recording.path}: no labels pose_1..6 ({found}); targets.csv with them is expected beside the frames")
     varied = [] if experiment is None else [name for name, (low, high) in experiment.pose.model_dump().items() if high > low]
@@ -68,7 +67,7 @@ def read_arm_labels(recording: Recording, experiment: ExperimentSpec | None = No
             "add the column, or give the experiment that the frames were recorded with (`experiment`)"
         )
     none = np.zeros(len(recording))
-    values = {name: numbers(recording.labels[name]) if name in recording.labels else none for name in names}
+    values = {name: numbers(recording.labels[name]) if name in recording.labels else none for name in LABELS}
     table = np.column_stack(list(values.values()))
     odd = ~np.isfinite(table).all(axis=1)
     if odd.any():

@@ -31,7 +31,7 @@ import numpy as np
 from scenes.body import GelSpec, RelaxationTerm, SkinSpec
 from twin.compiled import compiled
 from twin.geometry.solid import Cells, Solid
-from twin.mechanics.body.material import add_second_stress, determinant, distortion_stiffness, first_piola, invariants, law_coefficients
+from twin.mechanics.body.material import distortion_stiffness, distortion_stress, first_piola, invariants, law_coefficients, second_stress
 from twin.types import BoolArray, FloatArray, IntArray
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # directions (i, k) of the stored stiffness blocks
@@ -72,8 +72,7 @@ class Elements:
 
     def add_volume(self, control_mm: FloatArray, out: FloatArray) -> float:
         """Increase of the volume in mm^3. The method adds its gradient with respect to the controls, in mm^2, to ``out`` (n, 3)."""
-        nothing = np.zeros(6), np.zeros(0), np.zeros((0, 8, 3, 3))
-        return _forces((self.cells, *nothing), np.ascontiguousarray(control_mm), 1.0, out)
+        return _forces((self.cells, np.zeros(6), np.zeros(0), np.zeros((0, 8, 3, 3))), np.ascontiguousarray(control_mm), 1.0, out)
 
     @property
     def rest_volume_mm3(self) -> float:
@@ -84,8 +83,10 @@ class Elements:
         """Second Piola-Kirchhoff stress of the law's distortion part at the Gauss points, (m, 8, 3, 3) in MPa, and the stress of the
         difference: kappa_d times half the difference of the levels' volume strains, (m,) in MPa.
         """
-        stress, half = _relaxing(self.cells, self.law, np.ascontiguousarray(control_mm))
-        return stress, self.law[5] * half
+        controls, gradients, weights = self.cells
+        f = np.einsum("mai,mqja->mqij", control_mm[controls], gradients, optimize=True)
+        swelling = (weights * np.linalg.det(f)).reshape(-1, 2, 4).sum(axis=2) / weights.reshape(-1, 2, 4).sum(axis=2)
+        return distortion_stress(self.law, f), self.law[5] * (swelling[:, 0] - swelling[:, 1]) / 2
 
     def stiffness(self, control_mm: FloatArray, pressure_mpa: float, out: FloatArray, *, which: IntArray | None = None) -> None:
         """Write the second derivative of each element's energy, N/mm, into ``out`` (m, 6, b, b), in the precision of ``out``.
@@ -271,8 +272,10 @@ def _push(grad: FloatArray, weights: FloatArray, stress: FloatArray, out: FloatA
 
 
 @compiled(fastmath=True)
-def _kinematics(x: FloatArray, grad: FloatArray, weights: FloatArray, f: FloatArray, det: FloatArray) -> tuple[float, float, float, float]:
-    """Write F and det F at all points; returns the volumes of the levels, at rest and deformed.
+def _kinematics(
+    x: FloatArray, grad: FloatArray, weights: FloatArray, f: FloatArray, det: FloatArray, g: FloatArray
+) -> tuple[float, float, float, float]:
+    """Write F, det F and F^-T at all points; returns the volumes of the levels, at rest and deformed.
 
     The first volume is negative if the element is inside out.
     """
@@ -280,7 +283,7 @@ def _kinematics(x: FloatArray, grad: FloatArray, weights: FloatArray, f: FloatAr
     for q in range(8):
         deformation(x, grad[q], f[q])
     for q in range(8):
-        det[q] = determinant(f[q])
+        det[q] = invariants(f[q], g[q])
         if det[q] <= 0:
             return -1.0, 0.0, 0.0, 0.0
         if q < 4:
@@ -290,15 +293,6 @@ def _kinematics(x: FloatArray, grad: FloatArray, weights: FloatArray, f: FloatAr
             r1 += weights[q]
             v1 += weights[q] * det[q]
     return r0, r1, v0, v1
-
-
-@compiled(fastmath=True)
-def _add_second(c01: float, f: FloatArray, weights: FloatArray, stress: FloatArray) -> float:
-    """Add the c01 part of the law to the first Piola-Kirchhoff stress at all points; returns its energy."""
-    energy = 0.0
-    for q in range(8):
-        energy += weights[q] * add_second_stress(c01, f[q], stress[q])
-    return energy
 
 
 @compiled(fastmath=True)
@@ -321,11 +315,12 @@ def _forces(parts: Parts, control: FloatArray, sealing: float, out: FloatArray) 
     (elements, gradients, weights), law, extra, given = parts
     count = elements.shape[1]
     x, push = np.zeros((3, count)), np.zeros((3, count))
-    f, det, stress = np.zeros((8, 3, 3)), np.zeros(8), np.zeros((8, 3, 3))
+    f, g, stress = np.zeros((8, 3, 3)), np.zeros((8, 3, 3)), np.zeros((8, 3, 3))
+    det = np.zeros(8)
     energy = 0.0
     for m in range(len(elements)):
         gather(control, elements[m], x)
-        r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, det)
+        r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, det, g)
         if r0 < 0:
             return np.inf
         rest = r0 + r1
@@ -334,9 +329,11 @@ def _forces(parts: Parts, control: FloatArray, sealing: float, out: FloatArray) 
         energy += rest * (law[4] / 2 * mean**2 + law[5] / 2 * half**2 + sealing * mean + more * half)
         pressure, lean = sealing + law[4] * mean, (law[5] * half + more) * rest / 2
         for q in range(8):
-            energy += weights[m, q] * first_piola(law, f[q], det[q], pressure + (lean / r0 if q < 4 else -lean / r1), stress[q])
+            push_out = pressure + (lean / r0 if q < 4 else -lean / r1)
+            energy += weights[m, q] * first_piola(law, f[q], det[q], g[q], push_out, stress[q])
         if law[1] != 0:
-            energy += _add_second(law[1], f, weights[m], stress)
+            for q in range(8):
+                energy += weights[m, q] * second_stress(law[1], f[q], det[q], g[q], stress[q])
         if len(given):
             energy += _add_prescribed(given[m], f, weights[m], stress)
         _push(gradients[m], weights[m], stress, push)
@@ -360,7 +357,7 @@ def _stiffness(parts: Parts, which: IntArray, control: FloatArray, sealing: floa
     for m in which:
         gather(control, elements[m], x)
         grad = gradients[m].reshape(24, count)
-        r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, det)
+        r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, det, g)
         rest = r0 + r1
         mean, half = (v0 + v1) / rest - 1, (v0 / r0 - v1 / r1) / 2
         more = extra[m] if len(extra) else 0.0
@@ -368,7 +365,6 @@ def _stiffness(parts: Parts, which: IntArray, control: FloatArray, sealing: floa
         for q in range(8):
             w = weights[m, q]
             lean = rest / (2 * r0) if q < 4 else -rest / (2 * r1)
-            invariants(f[q], g[q])
             push = (sealing + law[4] * mean + (law[5] * half + more) * lean) * det[q]
             distortion_stiffness(law, f[q], det[q], g[q], tangent)
             for p in range(6):
@@ -400,28 +396,3 @@ def _stiffness(parts: Parts, which: IntArray, control: FloatArray, sealing: floa
                 size, lean_size = scale[0] * swell[0, FIRST[p], a], scale[1] * swell[1, FIRST[p], a]
                 for b in range(count):
                     out[m, p, a, b] = product[count * p + a, b] + size * swell[0, SECOND[p], b] + lean_size * swell[1, SECOND[p], b]
-
-
-@compiled(fastmath=True)
-def _relaxing(cells: Cells, law: FloatArray, control: FloatArray) -> tuple[FloatArray, FloatArray]:
-    elements, gradients, weights = cells
-    count = elements.shape[1]
-    x = np.zeros((3, count))
-    f, det, stress = np.zeros((8, 3, 3)), np.zeros(8), np.zeros((8, 3, 3))
-    g = np.zeros((3, 3))
-    out, half = np.zeros((len(elements), 8, 3, 3)), np.zeros(len(elements))
-    for m in range(len(elements)):
-        gather(control, elements[m], x)
-        r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, det)
-        half[m] = (v0 / r0 - v1 / r1) / 2
-        for q in range(8):
-            first_piola(law, f[q], det[q], 0.0, stress[q])
-        if law[1] != 0:
-            _add_second(law[1], f, weights[m], stress)
-        for q in range(8):
-            invariants(f[q], g)
-            for i in range(3):
-                for j in range(3):
-                    for k in range(3):  # S = F^-1 P, and g is F^-T
-                        out[m, q, i, j] += g[k, i] * stress[q, k, j]
-    return out, half

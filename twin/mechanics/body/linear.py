@@ -76,8 +76,8 @@ class FrontalSolver:
 
     Attributes
     ----------
-    kept : (k,) int
-        The kept unknowns.
+    kept, inner : (k,), (i,) int
+        The kept unknowns and the eliminated ones.
     """
 
     def __init__(self, groups: list[IntArray], boxes: list[IntArray], fixed: BoolArray, keep: BoolArray) -> None:
@@ -121,6 +121,7 @@ class FrontalSolver:
             )
             self._fronts.append(front)
         self.kept, self._eliminating = self._fronts[-1].border, [front for front in self._fronts if len(front.own)]
+        self.inner = np.setdiff1d(np.arange(self.size), self.kept)
 
     def eliminate(self, blocks: list[FloatArray], *, shift: float = 0.0) -> FloatArray:
         """Eliminate all unknowns except the kept ones, until the next call.
@@ -135,7 +136,7 @@ class FrontalSolver:
         Returns
         -------
         (k, k) float
-            Remaining matrix of the kept unknowns (Schur complement); lower triangle.
+            Remaining matrix of the kept unknowns (Schur complement): the lower triangle, and zeros.
 
         Raises
         ------
@@ -150,7 +151,7 @@ class FrontalSolver:
                 if len(which):
                     _assemble(block, which, places, front.head, front.below, rest)
             for child, places in front.children:
-                _extend(rests.pop(child).T, places, front.head.T, front.below.T, rest.T)
+                _extend(rests.pop(child).T, places, np.searchsorted(places, len(front.head)), front.head.T, front.below.T, rest.T)
             if not len(front.own):
                 continue
             if shift:
@@ -162,10 +163,6 @@ class FrontalSolver:
                 blas.strsm(1.0, front.head, front.below, side=1, lower=1, trans_a=1, overwrite_b=1)
                 blas.ssyrk(-1.0, front.below, beta=1.0, c=rest, lower=1, overwrite_c=1)
         return rest
-
-    def inner(self, values: FloatArray) -> FloatArray:
-        """The part of values (unknowns,) at the eliminated unknowns."""
-        return np.delete(values, self.kept)
 
     def forward(self, right_side: FloatArray) -> FloatArray:
         """Forward elimination of a right side (unknowns,). Its entries at ``kept`` are then the right side for the remaining matrix."""
@@ -203,17 +200,6 @@ def _inside(boxes: IntArray, box: Box) -> BoolArray:
 
 
 @compiled()
-def whole(lower: FloatArray, shift: float) -> FloatArray:
-    """The symmetric matrix of a lower triangle, with a shift added to the diagonal."""
-    out = np.empty_like(lower)
-    for c in range(len(lower)):
-        out[c, c] = lower[c, c] + shift
-        for r in range(c + 1, len(lower)):
-            out[r, c] = out[c, r] = lower[r, c]
-    return out
-
-
-@compiled()
 def _assemble(elements: FloatArray, which: IntArray, places: IntArray, head: FloatArray, below: FloatArray, rest: FloatArray) -> None:
     """Add the symmetric blocks of elements to the lower triangle of a front."""
     own, count = len(head), elements.shape[2]
@@ -240,9 +226,12 @@ def _assemble(elements: FloatArray, which: IntArray, places: IntArray, head: Flo
 
 
 @compiled()
-def _extend(update: FloatArray, places: IntArray, head: FloatArray, below: FloatArray, rest: FloatArray) -> None:
-    """Add the remaining matrix (r, r) of an earlier front to a front. All arrays are transposed, so that columns are contiguous."""
-    own, inside = len(head), int(np.searchsorted(places, len(head)))
+def _extend(update: FloatArray, places: IntArray, inside: int, head: FloatArray, below: FloatArray, rest: FloatArray) -> None:
+    """Add the remaining matrix (r, r) of an earlier front to a front, of which ``inside`` places are in the head.
+
+    All arrays are transposed, so that columns are contiguous.
+    """
+    own = len(head)
     for j in range(len(places)):
         low = places[j]
         for k in range(j, inside):

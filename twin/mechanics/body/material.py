@@ -32,6 +32,17 @@ def law_coefficients(spec: MaterialSpec, *, layer: bool) -> FloatArray:
     return np.array([*(mu / 2 * np.array(spec.part.coefficients())), kappa, difference])
 
 
+def distortion_stress(law: FloatArray, f: FloatArray) -> FloatArray:
+    """Second Piola-Kirchhoff stresses (..., 3, 3) of a law without kappa, MPa, at deformation gradients F (..., 3, 3)."""
+    c, one = f.swapaxes(-1, -2) @ f, np.eye(3)
+    inverse, squared = np.linalg.inv(c), np.linalg.det(f)[..., None, None] ** (2 / 3)
+    trace = np.trace(c, axis1=-2, axis2=-1)[..., None, None]
+    second = (trace**2 - (c**2).sum(axis=(-2, -1), keepdims=True)) / 2
+    first = trace / squared - 3
+    slope = law[0] + first * (2 * law[2] + 3 * law[3] * first)
+    return 2 * (slope / squared * (one - trace / 3 * inverse) + law[1] / squared**2 * (trace * one - c - 2 / 3 * second * inverse))
+
+
 @compiled(inline="always")
 def invariants(f: FloatArray, g: FloatArray) -> float:
     """Return det F, and write F^-T into ``g`` (3, 3) if det F > 0."""
@@ -52,45 +63,32 @@ def invariants(f: FloatArray, g: FloatArray) -> float:
 
 
 @compiled(fastmath=True)
-def determinant(f: FloatArray) -> float:
-    """det F."""
-    minor_0 = f[1, 1] * f[2, 2] - f[1, 2] * f[2, 1]
-    minor_1 = f[1, 2] * f[2, 0] - f[1, 0] * f[2, 2]
-    minor_2 = f[1, 0] * f[2, 1] - f[1, 1] * f[2, 0]
-    return f[0, 0] * minor_0 + f[0, 1] * minor_1 + f[0, 2] * minor_2
-
-
-@compiled(fastmath=True)
-def first_piola(law: FloatArray, f: FloatArray, det: float, pressure: float, out: FloatArray) -> float:
-    """Return the energy density of the law without kappa and c01, MPa.
+def first_piola(law: FloatArray, f: FloatArray, det: float, g: FloatArray, pressure: float, out: FloatArray) -> float:
+    """Return the energy density of the law without kappa and c01, MPa; ``g`` is F^-T.
 
     The function writes its derivative with respect to F, plus ``pressure`` d det F / dF, into ``out`` (3, 3), MPa.
     """
-    f00, f01, f02, f10, f11, f12, f20, f21, f22 = f[0, 0], f[0, 1], f[0, 2], f[1, 0], f[1, 1], f[1, 2], f[2, 0], f[2, 1], f[2, 2]
-    trace = f00 * f00 + f01 * f01 + f02 * f02 + f10 * f10 + f11 * f11 + f12 * f12 + f20 * f20 + f21 * f21 + f22 * f22
-    scale = det ** (-2 / 3)
+    trace, scale = 0.0, det ** (-2 / 3)
+    for i in range(3):
+        for j in range(3):
+            trace += f[i, j] * f[i, j]
     first = scale * trace - 3
     a = 2 * scale * (law[0] + first * (2 * law[2] + 3 * law[3] * first))
-    energy = first * (law[0] + first * (law[2] + law[3] * first))
-    b = pressure - a * trace / (3 * det)
-    out[0, 0] = a * f00 + b * (f11 * f22 - f12 * f21)
-    out[0, 1] = a * f01 + b * (f12 * f20 - f10 * f22)
-    out[0, 2] = a * f02 + b * (f10 * f21 - f11 * f20)
-    out[1, 0] = a * f10 + b * (f02 * f21 - f01 * f22)
-    out[1, 1] = a * f11 + b * (f00 * f22 - f02 * f20)
-    out[1, 2] = a * f12 + b * (f01 * f20 - f00 * f21)
-    out[2, 0] = a * f20 + b * (f01 * f12 - f02 * f11)
-    out[2, 1] = a * f21 + b * (f02 * f10 - f00 * f12)
-    out[2, 2] = a * f22 + b * (f00 * f11 - f01 * f10)
-    return energy
+    b = pressure * det - a * trace / 3
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = a * f[i, j] + b * g[i, j]
+    return first * (law[0] + first * (law[2] + law[3] * first))
 
 
 @compiled(fastmath=True)
-def add_second_stress(c01: float, f: FloatArray, out: FloatArray) -> float:
-    """Add the c01 part of the law to a first Piola-Kirchhoff stress (3, 3); returns its energy density."""
-    g = np.zeros((3, 3))
-    scale = invariants(f, g) ** (-4 / 3)
-    second, slopes = _second_invariant(f, (f * f).sum())
+def second_stress(c01: float, f: FloatArray, det: float, g: FloatArray, out: FloatArray) -> float:
+    """Add the c01 part of the law to a first Piola-Kirchhoff stress (3, 3); returns its energy density. ``g`` is F^-T."""
+    scale, trace, slopes = det ** (-4 / 3), 0.0, np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            trace += f[i, j] * f[i, j]
+    second = _second_invariant(f, trace, slopes)
     for i in range(3):
         for j in range(3):
             out[i, j] += c01 * scale * (slopes[i, j] - 4 / 3 * second * g[i, j])
@@ -123,7 +121,8 @@ def distortion_stiffness(law: FloatArray, f: FloatArray, det: float, g: FloatArr
 @compiled(fastmath=True)
 def _add_second_stiffness(factor: float, f: FloatArray, g: FloatArray, trace: float, out: FloatArray) -> None:
     """Add the c01 part of ``distortion_stiffness``."""
-    second, slopes = _second_invariant(f, trace)
+    slopes = np.empty((3, 3))
+    second = _second_invariant(f, trace, slopes)
     for i in range(3):
         for j in range(3):
             for k in range(3):
@@ -140,8 +139,15 @@ def _add_second_stiffness(factor: float, f: FloatArray, g: FloatArray, trace: fl
 
 
 @compiled(fastmath=True)
-def _second_invariant(f: FloatArray, trace: float) -> tuple[float, FloatArray]:
-    """I2 of C, and its derivative 2 (tr C F - F C) with respect to F."""
-    c = f.T @ f
-    second = (trace * trace - (c * c).sum()) / 2
-    return second, 2 * (trace * f - f @ c)
+def _second_invariant(f: FloatArray, trace: float, slopes: FloatArray) -> float:
+    """Return I2 of C, and write its derivative 2 (tr C F - F C) with respect to F into ``slopes`` (3, 3)."""
+    squares = 0.0
+    for j in range(3):
+        for i in range(3):
+            slopes[i, j] = 2 * trace * f[i, j]
+        for k in range(3):
+            c = f[0, k] * f[0, j] + f[1, k] * f[1, j] + f[2, k] * f[2, j]
+            squares += c * c
+            for i in range(3):
+                slopes[i, j] -= 2 * f[i, k] * c
+    return (trace * trace - squares) / 2

@@ -3,17 +3,25 @@
 Dr.Jit loads the first libLLVM that it finds. LLVM 15 and older abort the whole process at the first kernel (they have no instruction for
 IEEE fminimum). Therefore a library is chosen and tested here, before Dr.Jit searches for one. Nothing is imported or set before
 `use_variant` is called. `with_room` makes copies of arrays that are safe to give to Dr.Jit.
+
+A backend with an unsuitable LLVM or driver kills the process instead of raising an exception. Therefore it is tried in a child process
+(`probe`). Results are stored in the cache folder (see ``twin.store``) with a key of everything that could change them. If the cache is off,
+every process makes its own test.
 """
 
+import ctypes
 import ctypes.util
+import importlib.metadata
 import importlib.util
 import os
 import re
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
+from functools import cache
 from itertools import product
 from pathlib import Path
 from types import ModuleType
@@ -22,8 +30,8 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twin.errors import RenderError
-from twin.optics.variants.probes import load_needed_libraries, probe
+from twin.errors import RenderError, StoreError
+from twin.store import Item, cache_folder, find_json, keep_json
 
 DrJit: TypeAlias = Any
 """A value of Dr.Jit or an object of Mitsuba. Their classes belong to the variant, which is chosen while the program runs."""
@@ -46,6 +54,29 @@ _BELOW = ("", "lib/", "*-linux-gnu/", "llvm*/lib/", "LLVM/bin/", "Library/bin/")
 _LIBRARIES = ("libLLVM*.so*", "libLLVM*.dylib", "LLVM-C.dll")
 _LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 _VARIANT_VARIABLE = "TACTIP_VARIANT"
+PRIVATE_FOLDER = Path(sys.prefix) / "lib" / "private"
+"""Folder for the copies of libraries that 'make setup' makes if it has no permission to install them."""
+ATOMIC_REMEDY = "install it (Debian, Ubuntu: apt-get install libatomic1)"
+"""Advice in the message that libatomic is missing."""
+PROBE_TIMEOUT_S = 60.0
+"""Time after which a probe counts as failed, s."""
+
+# Dr.Jit gets an empty home folder, so that it does not use a kernel that it compiled before with another LLVM.
+_PROBE = """
+try:  # no core dump
+    import resource
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+except ImportError:
+    pass
+import drjit as dr
+from drjit.{backend} import Float
+x = dr.arange(Float, 64)
+y = dr.minimum(dr.maximum(dr.sin(x), 0.25), dr.rcp(x + 1.5))
+dr.eval(y)
+assert 0 < dr.sum(y)[0] < 64
+version = dr.detail.llvm_version() if "{backend}" == "llvm" and hasattr(dr.detail, "llvm_version") else ""
+print("probe-ok", version)
+"""
 
 
 def with_room(values: ArrayLike, dtype: type[Number]) -> NDArray[Number]:
@@ -309,3 +340,75 @@ def _libcuda() -> Path | None:
     places += os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep)
     found = (Path(place) / name for place in filter(None, places))
     return next((path for path in found if path.exists()), None)
+
+
+def load_needed_libraries(folder: Path = PRIVATE_FOLDER) -> str:
+    """Load libatomic so that Dr.Jit finds it: the system's, else the private copy in ``folder``.
+
+    Returns
+    -------
+    str
+        "" if it was loaded, else what is missing and the remedy.
+    """
+    if not sys.platform.startswith("linux"):
+        return ""
+    for library in ("libatomic.so.1", str(folder / "libatomic.so.1")):
+        try:
+            ctypes.CDLL(library, mode=ctypes.RTLD_GLOBAL)
+            return ""
+        except OSError:
+            continue
+    return f"libatomic.so.1 is missing, which Mitsuba needs: {ATOMIC_REMEDY}"
+
+
+@dataclass(frozen=True)
+class ProbeResult:
+    """Result of a probe: ``ok``, the backend's ``version`` ("" if unknown), and the reason if it does not work."""
+
+    ok: bool
+    version: str
+    reason: str
+
+
+def probe(backend: str, library: Path, *, remember_failure: bool = True) -> ProbeResult:
+    """Run a tiny kernel on ``backend`` ("llvm" or "cuda") with ``library``, or return the stored result."""
+    devices = os.environ.get("CUDA_VISIBLE_DEVICES", "") if backend == "cuda" else ""
+    tried = [str(library), library.stat().st_mtime_ns, importlib.metadata.version("drjit"), devices]
+    item = Item(f"backend-{backend}", (__name__,), tried)
+    folder = cache_folder()
+    if folder is None:
+        return _run_once(item.file, backend, library)
+    known = find_json(folder, item)
+    if known is not None:
+        return ProbeResult(**known)
+    verdict = _run(backend, library)
+    if verdict.ok or remember_failure:
+        with suppress(StoreError):  # if the cache can't be written, the next start probes again
+            keep_json(folder, item, asdict(verdict))
+    return verdict
+
+
+@cache
+def _run_once(key: str, backend: str, library: Path) -> ProbeResult:
+    return _run(backend, library)
+
+
+def _run(backend: str, library: Path) -> ProbeResult:
+    with tempfile.TemporaryDirectory() as home:
+        env = dict(os.environ, HOME=home, APPDATA=home, LOCALAPPDATA=home, PYTHONPATH=os.pathsep.join(p for p in sys.path if p))
+        env["LD_LIBRARY_PATH"] = os.pathsep.join(filter(None, [str(PRIVATE_FOLDER), os.environ.get("LD_LIBRARY_PATH")]))
+        if backend == "llvm":
+            env["DRJIT_LIBLLVM_PATH"] = str(library)
+        command = [sys.executable, "-c", _PROBE.format(backend=backend)]
+        try:
+            done = subprocess.run(command, env=env, cwd=home, capture_output=True, text=True, errors="replace", timeout=PROBE_TIMEOUT_S)
+        except (subprocess.TimeoutExpired, OSError) as error:
+            return ProbeResult(False, "", f"the probe did not finish: {error.__class__.__name__}")
+    for line in done.stdout.splitlines():
+        if line.startswith("probe-ok") and done.returncode == 0:
+            numbers = [n for n in "".join(c if c.isdigit() else " " for c in line).split() if n != "0"]
+            return ProbeResult(True, ".".join(numbers), "")
+    lines = [line.strip() for line in done.stderr.splitlines() if line.strip()]
+    telling = [line for line in lines if "LLVM ERROR" in line or "Error" in line or "failed" in line] or lines[-1:] or ["no message"]
+    how = f"killed by signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
+    return ProbeResult(False, "", f"a tiny kernel does not run ({how}: {telling[0][:160]})")

@@ -371,7 +371,7 @@ def _camera(
             nearer = {key: getattr(start.camera, key) * FISHEYE_MM / PINHOLE_MM for key in ("fx_px", "fy_px", "distance_mm")}
             trial = trial.alter(camera=nearer)
         trial = trial.alter(camera=camera_seeing(trial, pins_px, np.flatnonzero(np.isfinite(pins_px[:, 0]))))
-        fitted, report = fit_camera(trial, pins_px, free=free, named=True)
+        fitted, report = fit_camera(trial, pins_px, free=free)
         fitted, uneven = _with_sizes(fitted, sizes_px)
         misfit = float(np.hypot(report.rms_px / sd_px, uneven / SIZE_SD))
         tried.append((misfit, fitted, report))

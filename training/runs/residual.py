@@ -25,7 +25,7 @@ from twin.camera.projection import Disc, lens_disc
 from twin.camera.residual import LEAK, LEVELS, MIDDLE, MOST_LEVELS, STEEPNESS, differences, with_residual
 from twin.errors import FrameError, format_count
 from twin.evaluation.pictures.aligned import read_real, with_changes
-from twin.evaluation.pictures.images import compare_images
+from twin.evaluation.pictures.compare import compare_images
 from twin.frames.recording import BadFrame
 from twin.mechanics.skin_fit import SkinFit
 from twin.optics.render import Renderer
@@ -131,15 +131,15 @@ def calibrate_residual(
     sensor = with_changes(sensor, response={"residual": None})
     disc = lens_disc(sensor.view, sensor.housing)
     with stage(progress, "read the frames, find their pins") as step:
-        read = read_real(frames, sensor, disc, fitted=fitted, progress=step)
-    if len(read.frames) < LEAST_TAUGHT:
-        raise FrameError(f"{frames}: valid frames beside the {fitted} fitted ones: {len(read.frames)}; give {LEAST_TAUGHT} or more")
+        read, _ = read_real(frames, sensor, disc, fitted=fitted, progress=step)
+    if len(read) < LEAST_TAUGHT:
+        raise FrameError(f"{frames}: valid frames beside the {fitted} fitted ones: {len(read)}; give {LEAST_TAUGHT} or more")
     fit, renderer, light = SkinFit(sensor), Renderer(sensor), []
     with stage(progress, "fit the skin to the pins, render") as step:
-        for done, each in enumerate(read.frames):
+        for done, each in enumerate(read):
             light.append(renderer.render(fit(each.pins_px), seed=done))
-            step(done + 1, len(read.frames))
-    real = [each.frame.image for each in read.frames]
+            step(done + 1, len(read))
+    real = [each.frame.image for each in read]
     plain = [expose(each, sensor.capture, np.random.default_rng(k)) for k, each in enumerate(light)]
     found = list(plain)
     halves = [np.arange(len(real))[k::2] for k in (0, 1)]

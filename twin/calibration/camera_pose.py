@@ -123,10 +123,8 @@ def fit_camera(spec: SensorSpec, pins_px: np.ndarray, *, free: tuple[str, ...] =
     Raises
     ------
     FrameError
-        A parameter is unknown, or there are too few pins.
+        There are too few pins.
     """
-    if unknown := set(free) - set(PARAMETERS):
-        raise FrameError(f"{sorted(unknown)[0]} is not a parameter of the camera's fit; choose from {', '.join(PARAMETERS)}")
     count = int(np.isfinite(pins_px).all(axis=1).sum())
     if count < LEAST_PINS:
         raise FrameError(f"{count} of {spec.pins.count} pins found; {LEAST_PINS} or more are needed: give another no-contact frame")

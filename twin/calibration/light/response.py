@@ -2,10 +2,11 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares, minimize_scalar
+from scipy.optimize import approx_fprime, least_squares, minimize_scalar
 
 from scenes.sensor import LensSpec, ResponseSpec, SensorSpec
 from twin.calibration.light.photometry import MOST_HAZE
@@ -92,9 +93,7 @@ def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray
     start[names.index("sharpening")] = max(spec.response.sharpening, LEAST_SHARPENING)
 
     def slopes(values: np.ndarray) -> np.ndarray:
-        at = residual(values)
-        steps = np.where(values + unit <= high, unit, -unit)
-        return np.stack([(residual(values + step * row) - at) / step for step, row in zip(steps, np.eye(len(names)), strict=True)], axis=1)
+        return approx_fprime(values, residual, np.where(values + unit <= high, unit, -unit))
 
     fit = least_squares(
         residual, start, slopes, bounds=(low, high), x_scale=unit, loss="soft_l1", f_scale=ROBUST_LEVELS, max_nfev=MOST_TRIES
@@ -201,14 +200,11 @@ def fit_focus(spec: SensorSpec, seen: Sharpness) -> SensorSpec:
     """
     before = defocus_px(spec.camera.fx_px, spec.camera.aperture_mm, spec.camera.focus_mm, seen.distance_mm)
     wanted = seen.real_px**2 - seen.rendered_px**2 + (DISC_WIDTH * before) ** 2
-    best = (np.inf, 0.0, spec.camera.focus_mm)
-    for focus in np.linspace(FOCUS_RANGE[0] * seen.distance_mm.min(), FOCUS_RANGE[1] * seen.distance_mm.max(), TRIED):
-        for aperture in np.linspace(0, MOST_APERTURE_MM, TRIED):
-            grown = (DISC_WIDTH * defocus_px(spec.camera.fx_px, aperture, focus, seen.distance_mm)) ** 2
-            miss = float(np.var(wanted - grown))
-            if miss < best[0]:
-                best = miss, aperture, focus
-    return with_changes(spec, camera={"aperture_mm": round(best[1], 3), "focus_mm": round(float(best[2]), 2)})
+    nearest, farthest = FOCUS_RANGE[0] * seen.distance_mm.min(), FOCUS_RANGE[1] * seen.distance_mm.max()
+    tried = list(product(np.linspace(nearest, farthest, TRIED), np.linspace(0, MOST_APERTURE_MM, TRIED)))
+    grown = [(DISC_WIDTH * defocus_px(spec.camera.fx_px, aperture, focus, seen.distance_mm)) ** 2 for focus, aperture in tried]
+    focus, aperture = tried[int(np.argmin(np.var(wanted - grown, axis=1)))]
+    return with_changes(spec, camera={"aperture_mm": round(float(aperture), 3), "focus_mm": round(float(focus), 2)})
 
 
 def defocus_px(focal_px: float, aperture_mm: float, focus_mm: float, distance_mm: np.ndarray) -> np.ndarray:

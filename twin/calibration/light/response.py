@@ -6,7 +6,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy.optimize import approx_fprime, least_squares, minimize_scalar
+from scipy.optimize import least_squares, minimize_scalar
 
 from scenes.sensor import LensSpec, ResponseSpec, SensorSpec
 from twin.calibration.light.photometry import MOST_HAZE
@@ -93,7 +93,9 @@ def fit_response(spec: SensorSpec, frames: list[Aligned], light: list[np.ndarray
     start[names.index("sharpening")] = max(spec.response.sharpening, LEAST_SHARPENING)
 
     def slopes(values: np.ndarray) -> np.ndarray:
-        return approx_fprime(values, residual, np.where(values + unit <= high, unit, -unit))
+        at = residual(values)
+        steps = np.where(values + unit <= high, unit, -unit)
+        return np.stack([(residual(values + step * row) - at) / step for step, row in zip(steps, np.eye(len(names)), strict=True)], axis=1)
 
     fit = least_squares(
         residual, start, slopes, bounds=(low, high), x_scale=unit, loss="soft_l1", f_scale=ROBUST_LEVELS, max_nfev=MOST_TRIES

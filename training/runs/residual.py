@@ -131,7 +131,7 @@ def calibrate_residual(
     sensor = with_changes(sensor, response={"residual": None})
     disc = lens_disc(sensor.view, sensor.housing)
     with stage(progress, "read the frames, find their pins") as step:
-        read, _ = read_real(frames, sensor, disc, fitted=fitted, progress=step)
+        read, refused = read_real(frames, sensor, disc, fitted=fitted, progress=step)
     if len(read) < LEAST_TAUGHT:
         raise FrameError(f"{frames}: valid frames beside the {fitted} fitted ones: {len(read)}; give {LEAST_TAUGHT} or more")
     fit, renderer, light = SkinFit(sensor), Renderer(sensor), []
@@ -160,7 +160,7 @@ def calibrate_residual(
     shift_px = _shift_px(sensor, plain, found)
     spec = with_changes(sensor, response={"residual": residual.model_dump()})
     write_sensor(out, spec, f"With a residual network that was trained on {format_count(len(real), 'frames')} of {frames.name}.")
-    return TaughtResidual(spec, len(real), before, after, real_told, (psnr_db[0], psnr_db[1]), shift_px, read.refused, [out])
+    return TaughtResidual(spec, len(real), before, after, real_told, (psnr_db[0], psnr_db[1]), shift_px, refused, [out])
 
 
 def _shift_px(sensor: SensorSpec, first: list[ImageArray], second: list[ImageArray]) -> tuple[float, float]:

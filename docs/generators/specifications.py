@@ -13,7 +13,7 @@ from pydantic.fields import FieldInfo
 from hardware.safety.decide import SafetyLimits
 from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, SensorSpec, ServoSpec
 from scenes.base import OpenSection, Section
-from twin.evaluation.degradation.plan import SweepPlan
+from twin.evaluation.degradation.study import SweepPlan
 from twin.pins import DetectorSpec
 
 

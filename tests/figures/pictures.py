@@ -9,7 +9,7 @@ from bench_render import CHOSEN, DRAWN, Bench
 from figures.jobs import NO_RESIDUAL, Measured, Value, job, real_folder, run_twin
 from scenes import load_sensor
 from training.runs.residual import calibrate_residual
-from twin.evaluation.pictures.images import compare_images
+from twin.evaluation.pictures.compare import compare_images
 from twin.frames import open_recording
 from twin.optics.relief import DETAILS
 from twin.simulator import Simulator
@@ -129,7 +129,7 @@ def speed(work: Path) -> Measured:
     "render.at_rest",
     "pytest -m slow -s tests/system/test_real.py",
     sensors=tuple(RECORDED),
-    code=("twin.simulator", "twin.evaluation.pictures.images"),
+    code=("twin.simulator", "twin.evaluation.pictures.compare"),
     recordings=tuple(RECORDED.values()),
     minutes=1,
 )

@@ -7,7 +7,7 @@ import pytest
 
 from scenes import load_object, load_sensor
 from twin.camera.projection import project
-from twin.evaluation.pictures.images import compare_images
+from twin.evaluation.pictures.compare import compare_images
 from twin.frames import open_recording
 from twin.frames.forms import recording_to_raw
 from twin.mechanics.path import ContactPose

@@ -11,7 +11,7 @@ import pytest
 
 from scenes import load_experiment, load_object, load_sensor
 from twin.evaluation.labelled import ContactModel, compare, measure_frames, table_of
-from twin.evaluation.labelled.compare import pin_errors
+from twin.evaluation.labelled.model import pin_errors
 
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 

@@ -21,9 +21,9 @@ SLIGHT_BLUR_PX = 0.6
 def real(real_dir):
     spec = load_sensor("ur5-331")
     disc = lens_disc(spec.view, spec.housing)
-    found = read_real(real_dir / "ur5-331-raw", spec, disc)
-    assert not found.refused
-    return disc, found.frames
+    found, refused = read_real(real_dir / "ur5-331-raw", spec, disc)
+    assert not refused
+    return disc, found
 
 
 def test_halves_of_the_real_frames_have_the_same_caps(real):

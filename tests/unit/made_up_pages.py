@@ -24,8 +24,7 @@ from twin.demo.make_demo import write_page as write_demo_page
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.evaluation.pictures import report as realism
 from twin.evaluation.pictures.aligned import RealFrame
-from twin.evaluation.pictures.compare import Pair
-from twin.evaluation.pictures.images import ImageFigures
+from twin.evaluation.pictures.compare import ImageFigures, Pair
 from twin.evaluation.pictures.statistics import RADIAL_MEASURES, RadialRow
 from twin.mechanics.path import ContactPose
 from twin.pins import make_graph, nominal_reference

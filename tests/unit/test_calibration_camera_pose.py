@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twin.calibration.camera_pose import PARAMETERS, fit_camera, nearest_order
+from twin.calibration.camera_pose import PARAMETERS, fit_camera
 from twin.camera.projection import project
 from twin.errors import FrameError
 from twin.geometry.pins import rest_pins
@@ -19,9 +19,9 @@ def changed(spec, *, camera=None, pins=None):
 
 
 def seen(spec, rng, noise_px=NOISE_PX):
-    """Pins of a frame at rest, in any order."""
+    """Pins of a frame at rest."""
     caps = project(spec.view, rest_pins(spec.geometry).caps_mm)
-    return rng.permutation(caps + rng.normal(0, noise_px, caps.shape))
+    return caps + rng.normal(0, noise_px, caps.shape)
 
 
 def perturbed(spec):
@@ -64,11 +64,6 @@ def test_a_wrong_value_of_a_held_parameter_is_compensated_by_the_others(sensor):
     assert report.rms_px < DEGENERATE_PX
 
 
-def test_pins_are_told_apart_whatever_the_cameras_place_scale_and_turn(sensor):
-    order = np.random.default_rng(4).permutation(sensor.pins.count)
-    assert np.array_equal(nearest_order(perturbed(sensor), project(sensor.view, rest_pins(sensor.geometry).caps_mm)[order]), order)
-
-
 def test_an_exact_frame_is_met_exactly_and_some_pins_may_be_missing(sensor):
     pins_px = project(sensor.view, rest_pins(sensor.geometry).caps_mm)
     pins_px[3::17] = np.nan
@@ -76,9 +71,7 @@ def test_an_exact_frame_is_met_exactly_and_some_pins_may_be_missing(sensor):
     assert report.rms_px < SAME_PX and report.pins == np.isfinite(pins_px).all(axis=1).sum()
 
 
-def test_unknown_parameters_and_too_few_pins_are_refused(sensor):
+def test_too_few_pins_are_refused(sensor):
     pins_px = project(sensor.view, rest_pins(sensor.geometry).caps_mm)
-    with pytest.raises(FrameError, match="focal.*fx_px"):
-        fit_camera(sensor, pins_px, free=("focal",))
     with pytest.raises(FrameError, match="5 of"):
-        fit_camera(sensor, pins_px[:5])
+        fit_camera(sensor, np.where(np.arange(len(pins_px))[:, None] < 5, pins_px, np.nan))

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 from plain_sensor import plain
 
-from twin.calibration.light.photometry import fit_photometry
-from twin.calibration.light.surroundings import fit_surroundings
-from twin.calibration.optics import _stages
+from twin.calibration.optics import _stages, fit_surroundings
 from twin.camera.capture import expose
 from twin.camera.projection import lens_disc, project
 from twin.errors import FrameError
@@ -50,8 +48,6 @@ def test_a_mono_specification_refuses_colour_frames_by_name(drawn, tmp_path):
     assert len(read_frames(tmp_path, spec, 6, quiet)[0]) == 1
     with pytest.raises(FrameError, match=r'seen.png: a colour frame.*channels = "color"'):
         read_frames(tmp_path, mono, 6, quiet)
-    with pytest.raises(FrameError, match=r'seen.png: a colour frame.*channels = "color"'):
-        fit_photometry(mono, [aligned(mono, image)], quiet)
 
 
 def test_gray_frames_stored_as_colour_suit_a_mono_specification(drawn, tmp_path):
@@ -62,10 +58,11 @@ def test_gray_frames_stored_as_colour_suit_a_mono_specification(drawn, tmp_path)
     np.testing.assert_array_equal(found, image[..., 1])
 
 
-def test_a_colour_specification_refuses_gray_frames_by_name(drawn):
+def test_a_colour_specification_refuses_gray_frames_by_name(drawn, tmp_path):
     spec, image = drawn
+    cv2.imwrite(str(tmp_path / "seen.png"), image[..., 1])
     with pytest.raises(FrameError, match=r'seen.png: a gray frame.*channels = "mono"'):
-        fit_photometry(spec, [aligned(spec, image[..., 1])], quiet)
+        read_frames(tmp_path, spec, 6, quiet)
 
 
 def test_frames_of_the_cameras_own_kind_pass(drawn):
@@ -76,13 +73,17 @@ def test_frames_of_the_cameras_own_kind_pass(drawn):
         require_cameras_own(image[::2, ::2], "seen.png", spec.camera)
 
 
-@pytest.mark.parametrize("beside_px", [(-3.0, 0.0), (0.0, 1e4)])
-def test_pins_outside_the_picture_are_refused_by_number(drawn, beside_px):
+def test_thresholded_frames_are_refused(drawn):
     spec, image = drawn
-    pins_px = np.tile(project(spec.view, rest_pins(spec.geometry).caps_mm), (4, 1, 1))
-    pins_px[2, 7] = beside_px
-    with pytest.raises(FrameError, match=r"frame 2, pin 7: lies at .* outside the 384 x 288 px picture; give the pins"):
-        fit_surroundings(spec, np.stack([image] * 4), pins_px)
+    with pytest.raises(FrameError, match="thresholded"):
+        fit_surroundings(spec, np.where(image > 100, 255, 0).astype(np.uint8)[None], np.zeros((1, spec.pins.count, 2)))
+
+
+def test_frames_of_another_size_are_refused(drawn, tmp_path):
+    spec, image = drawn
+    cv2.imwrite(str(tmp_path / "seen.png"), image[::2, ::2])
+    with pytest.raises(FrameError, match="384x288"):
+        read_frames(tmp_path, spec, 6, quiet)
 
 
 @pytest.fixture(scope="module")

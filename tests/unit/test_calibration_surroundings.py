@@ -7,10 +7,9 @@ from plain_sensor import plain
 
 from twin.calibration.light.leds import fit_reflections
 from twin.calibration.light.still import median_still
-from twin.calibration.light.surroundings import fit_surroundings
+from twin.calibration.optics import fit_surroundings
 from twin.camera.capture import expose
 from twin.camera.projection import project
-from twin.errors import FrameError
 from twin.evaluation.pictures.aligned import SATURATED, with_changes
 from twin.geometry.pins import rest_pins
 from twin.optics.static_layer import static_layer
@@ -153,11 +152,3 @@ def test_parameters_of_other_fits_do_not_change(known, found):
     for section in ("gel", "lens", "camera", "response", "pins", "skin"):
         assert getattr(found, section) == getattr(start, section)
     assert (found.leds.power, found.leds.balance) == (start.leds.power, start.leds.balance)
-
-
-def test_thresholded_frames_and_other_sizes_are_refused(known):
-    start, _, images, pins_px = known
-    with pytest.raises(FrameError, match="thresholded"):
-        fit_surroundings(start, np.where(images > 100, 255, 0).astype(np.uint8), pins_px)
-    with pytest.raises(FrameError, match="384 x 288"):
-        fit_surroundings(start, images[:, ::2, ::2], pins_px)

@@ -12,11 +12,9 @@ from scenes.body import ASSUMED_FACTOR
 from scenes.rig import ForceSensorSpec
 from training.generation.config import draw_label
 from twin.calibration.contact import PARAMETERS, fit_contact
-from twin.calibration.contact.fit import expect, held_out_px
+from twin.calibration.contact.fit import CalibrationSetup, FittedContacts, expect, held_out_px
 from twin.calibration.contact.forces import ForceSetup
 from twin.calibration.contact.newtons import assume_stiffness, compare_forces, pressed_n
-from twin.calibration.contact.parameters import values_of, with_quantities
-from twin.calibration.contact.simulate import CalibrationSetup
 from twin.errors import FrameError
 from twin.evaluation.labelled.model import ContactModel, MeasuredFrames
 from twin.types import Form
@@ -59,7 +57,7 @@ def prepared(tmp_path_factory):
     config = small_config(home, experiment=load_experiment(telling(home)))
     true = config.sensor.model_copy(update={"rig": config.sensor.rig.model_copy(update=TRUTH)})
     measured, done = frames(config, true, range(FRAMES), bad=(4,))
-    setup = CalibrationSetup(config.sensor, config.experiment, config.object, Form.PROCESSED, ACROSS, home / "contacts", parameters=FITTED)
+    setup = CalibrationSetup(config.sensor, config.experiment, config.object, ACROSS, Form.PROCESSED, home / "contacts", parameters=FITTED)
     held, _ = frames(config, true, range(100, 103))
     return setup, measured, done, held
 
@@ -98,7 +96,7 @@ def test_frames_that_were_not_fitted_are_met_as_well(calibrated):
 @pytest.mark.slow
 def test_a_continued_calibration_computes_nothing_twice(calibrated, monkeypatch):
     setup, measured, _, fit, _ = calibrated
-    monkeypatch.setattr("twin.calibration.contact.simulate._contact", None)  # not callable: a new contact would fail
+    monkeypatch.setattr("twin.calibration.contact.fit._contact", None)  # not callable: a new contact would fail
     again = fit_contact(setup, measured)
     assert np.array_equal(again.value, fit.value) and np.array_equal(again.executed, fit.executed)
 
@@ -113,10 +111,11 @@ def test_parameters_that_frames_do_not_determine_stay_at_their_start():
 
 def test_values_go_into_the_specification_and_come_back(tmp_path):
     config = small_config(tmp_path)
-    values = values_of(config.sensor, config.experiment)
+    setup = FittedContacts(config.sensor, config.experiment, config.object, ACROSS)
+    values = setup.quantities
     moved = values + [0.1 * p.step for p in PARAMETERS]
-    there = with_quantities(config.sensor, config.experiment, moved, 1)
-    assert np.allclose(values_of(there, config.experiment), moved)
+    there = setup.sensor_with(moved, 1)
+    assert np.allclose(replace(setup, sensor=there).quantities, moved)
     assert there.rig.turn_offset_deg[:2] == (0, 0) and there.rig.turn_offset_deg[2] == pytest.approx(moved[3])
 
 

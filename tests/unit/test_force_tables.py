@@ -10,8 +10,8 @@ from scenes import load_experiment, load_object, load_sensor
 from scenes.rig import ForceSensorSpec, RigSpec
 from twin.calibration.contact import forces as module
 from twin.calibration.contact.calibrate import calibrate_to_file
+from twin.calibration.contact.fit import Z90
 from twin.calibration.contact.forces import FORCE_PARAMETERS, ForceSetup, find_conventions, fit_forces, noise_of, read_forces
-from twin.calibration.contact.parameters import Z90
 from twin.errors import FrameError, OptionError
 from twin.rig.labels import ArmLabel
 

@@ -25,7 +25,7 @@ from scenes.load import SHIPPED
 from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from twin.errors import ContactError, FrameError, OptionError, TwinError
-from twin.evaluation.degradation.plan import load_plan
+from twin.evaluation.degradation.study import load_plan
 from twin.frames import open_recording
 from twin.frames.forms import form_of
 from twin.geometry.solid import Resolution

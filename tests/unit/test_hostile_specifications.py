@@ -12,7 +12,7 @@ from scenes import SpecError, load_experiment, load_object, load_randomisation, 
 from scenes.files import DEEPEST, LARGEST_BYTES
 from scenes.load import SHIPPED
 from twin.errors import TwinError
-from twin.evaluation.degradation.plan import load_plan
+from twin.evaluation.degradation.study import load_plan
 from twin.pins import load_detector
 
 LONGEST_MESSAGE = 1000  # characters: what a terminal shows at once

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from plain_sensor import plain
 
-from twin.evaluation.pictures.images import cap_patches, fixed_share
+from twin.evaluation.pictures.compare import cap_patches, fixed_share
 from twin.geometry.pins import rest_pins
 from twin.mechanics.skin_fit import FittedPins
 from twin.optics.relief import SKIN_FROM, cap_planes

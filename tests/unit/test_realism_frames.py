@@ -36,10 +36,10 @@ def test_bad_frames_are_refused_by_name_and_good_ones_kept(tmp_path, spec, good)
         "a_good.png": good, "b_black.png": good // 16, "c_white.png": np.full_like(good, 255),
         "d_gap.png": gap, "e_small.png": good[:240, :320], "f_good.png": good,
     }  # fmt: skip
-    found = read(tmp_path, spec, images)
-    assert [real.frame.name for real in found.frames] == ["a_good.png", "f_good.png"]
-    assert np.isfinite(found.frames[0].pins_px).all()
-    reasons = {refused["image_name"]: refused["reason"] for refused in found.refused}
+    found, refused = read(tmp_path, spec, images)
+    assert [real.frame.name for real in found] == ["a_good.png", "f_good.png"]
+    assert np.isfinite(found[0].pins_px).all()
+    reasons = {each["image_name"]: each["reason"] for each in refused}
     for name, said in {"b_black": "black", "c_white": "saturated", "d_gap": "of 331 pins", "e_small": "expected 640x480"}.items():
         assert said in reasons[f"{name}.png"]
 
@@ -48,10 +48,10 @@ def test_few_lost_pins_are_left_out_where_the_others_are_fitted_and_many_are_not
     glint, gap = good.copy(), good.copy()
     glint[225:245, 270:290] = 15  # a cap or two
     gap[180:300, 230:350] = 15
-    found = read(tmp_path, spec, {"a_glint.png": glint, "b_gap.png": gap}, lost=FEW_LOST)
-    assert [real.frame.name for real in found.frames] == ["a_glint.png"]
-    assert 0 < np.isnan(found.frames[0].pins_px[:, 0]).sum() <= FEW_LOST * 331
-    assert "of 331 pins" in found.refused[0]["reason"]
+    found, refused = read(tmp_path, spec, {"a_glint.png": glint, "b_gap.png": gap}, lost=FEW_LOST)
+    assert [real.frame.name for real in found] == ["a_glint.png"]
+    assert 0 < np.isnan(found[0].pins_px[:, 0]).sum() <= FEW_LOST * 331
+    assert "of 331 pins" in refused[0]["reason"]
     with pytest.raises(FrameError, match="a_glint.png: .*pins"):
         read(tmp_path, spec, {})
 
@@ -74,5 +74,5 @@ def test_thresholded_recordings_are_refused(tmp_path):
 
 
 def test_a_limit_spreads_over_the_folder(tmp_path, spec, good):
-    found = read(tmp_path, spec, {f"frame_{k}.png": good for k in range(5)}, limit=3)
-    assert [real.frame.name for real in found.frames] == ["frame_0.png", "frame_2.png", "frame_4.png"]
+    found, _ = read(tmp_path, spec, {f"frame_{k}.png": good for k in range(5)}, limit=3)
+    assert [real.frame.name for real in found] == ["frame_0.png", "frame_2.png", "frame_4.png"]

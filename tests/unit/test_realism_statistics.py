@@ -7,7 +7,7 @@ import pytest
 from scenes import load_sensor
 from twin.camera.projection import lens_disc, round_disc
 from twin.errors import FrameError
-from twin.evaluation.pictures.images import compare_images
+from twin.evaluation.pictures.compare import compare_images
 from twin.evaluation.pictures.statistics import (
     bin_of,
     equal_count_edges,

@@ -18,12 +18,10 @@ from twin.errors import TwinError
 from twin.evaluation.degradation.condition import DegradedCase
 from twin.evaluation.degradation.conditions import CONDITIONS
 from twin.evaluation.degradation.envelope import NEAR, Envelope, crossing, curves_of, envelopes_of, evaluate_sweep, shares_of
-from twin.evaluation.degradation.measures import MEASURES, measure_frame
-from twin.evaluation.degradation.plan import ConditionPlan, SweepPlan, load_plan
 from twin.evaluation.degradation.report import _share_row, compare, write_report
 from twin.evaluation.degradation.shots import DegradedFrame, RealSource
-from twin.evaluation.degradation.study import check_pipelines, consensus
-from twin.evaluation.degradation.sweep import SweepSettings, cells_of, run_sweep
+from twin.evaluation.degradation.study import ConditionPlan, SweepPlan, check_pipelines, consensus, load_plan
+from twin.evaluation.degradation.sweep import MEASURES, SweepSettings, cells_of, measure_frame, run_sweep
 from twin.pins import Found, make_detector, shipped_detector
 from twin.pins.labelling.reference import nominal_reference
 from twin.types import Form, Frame

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from twin.errors import FrameError
-from twin.evaluation.pictures.images import compare_images
+from twin.evaluation.pictures.compare import compare_images
 
 ALL = np.ones((64, 80), bool)
 

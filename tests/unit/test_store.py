@@ -48,7 +48,7 @@ from twin.store.fingerprint import PACKAGES, ROOT
 
 SOLVER = "twin/mechanics/solver.py"
 KEEPERS = (  # the module of every function whose results are kept between runs
-    "twin.calibration.contact.simulate",
+    "twin.calibration.contact.fit",
     "training.data.dataset",
     "training.estimate.estimator",
     "training.generation.make",
@@ -65,7 +65,7 @@ KEEPERS = (  # the module of every function whose results are kept between runs
     "twin.objects.mesh_field",
 )
 SOLVED = (
-    "twin.calibration.contact.simulate",
+    "twin.calibration.contact.fit",
     "training.generation.make",
     "twin.evaluation.degradation.shots",
     "twin.evaluation.degradation.sweep",

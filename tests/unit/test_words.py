@@ -74,7 +74,6 @@ PARTICIPLES_ALLOWED = {
     ("twin/evaluation/degradation/conditions/optics.py", "reddened"),
     ("twin/evaluation/degradation/conditions/optics.py", "scratched"),
     ("twin/evaluation/degradation/conditions/placement.py", "distorted"),
-    ("twin/evaluation/degradation/conditions/placement.py", "mirrored"),
     ("twin/evaluation/degradation/conditions/placement.py", "rolled"),
     ("twin/evaluation/degradation/conditions/placement.py", "shifted"),
     ("twin/evaluation/degradation/conditions/placement.py", "tilted"),

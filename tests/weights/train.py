@@ -32,7 +32,7 @@ from training.runs.run_files import CONFIG, DISPLACEMENTS, SHIPPED, TENSORS, pac
 from training.studies.judging import measure_errors
 from training.studies.sim_to_real.discrepancy import Discrepancy, measure_residuals
 from training.studies.sim_to_real.steps import arm_labels, choose_frames, measured_of, widen_intervals, with_missing
-from twin.calibration.contact.simulate import CalibrationSetup
+from twin.calibration.contact.fit import CalibrationSetup
 from twin.store import output, overwriting, write_json
 
 RECORDINGS = {"mg400-331": "tac-vgnn-331", "mg400-127": "tac-vgnn-127"}
@@ -80,7 +80,7 @@ def with_discrepancy(sensor, folder: Path, sets: list[Dataset], real: Dataset) -
     """The simulated contacts with draws of the discrepancy that 40 labelled frames show, a list for each set."""
     experiment = load_experiment("surface-2d")
     few = real.rows(choose_frames(len(real), LABELLED, 0).few)
-    setup = CalibrationSetup(sensor, experiment, load_object(experiment.object), few.pins.form, ACROSS, folder / f"{sensor.name}-labelled")
+    setup = CalibrationSetup(sensor, experiment, load_object(experiment.object), ACROSS, few.pins.form, folder / f"{sensor.name}-labelled")
     setup.folder.mkdir(parents=True, exist_ok=True)
     missing = Discrepancy(measure_residuals(setup, measured_of(few)))
     return [[with_missing(with_noise(each, k), arm_labels(each), missing, SEED + k) for k in range(DRAWS)] for each in sets]

@@ -25,7 +25,7 @@ from twin.camera.projection import Disc, lens_disc
 from twin.camera.residual import LEAK, LEVELS, MIDDLE, MOST_LEVELS, STEEPNESS, differences, with_residual
 from twin.errors import FrameError, format_count
 from twin.evaluation.pictures.aligned import read_real, with_changes
-from twin.evaluation.pictures.images import compare_images
+from twin.evaluation.pictures.compare import compare_images
 from twin.frames.recording import BadFrame
 from twin.mechanics.skin_fit import SkinFit
 from twin.optics.render import Renderer
@@ -131,15 +131,15 @@ def calibrate_residual(
     sensor = with_changes(sensor, response={"residual": None})
     disc = lens_disc(sensor.view, sensor.housing)
     with stage(progress, "read the frames, find their pins") as step:
-        read = read_real(frames, sensor, disc, fitted=fitted, progress=step)
-    if len(read.frames) < LEAST_TAUGHT:
-        raise FrameError(f"{frames}: valid frames beside the {fitted} fitted ones: {len(read.frames)}; give {LEAST_TAUGHT} or more")
+        read, refused = read_real(frames, sensor, disc, fitted=fitted, progress=step)
+    if len(read) < LEAST_TAUGHT:
+        raise FrameError(f"{frames}: valid frames beside the {fitted} fitted ones: {len(read)}; give {LEAST_TAUGHT} or more")
     fit, renderer, light = SkinFit(sensor), Renderer(sensor), []
     with stage(progress, "fit the skin to the pins, render") as step:
-        for done, each in enumerate(read.frames):
+        for done, each in enumerate(read):
             light.append(renderer.render(fit(each.pins_px), seed=done))
-            step(done + 1, len(read.frames))
-    real = [each.frame.image for each in read.frames]
+            step(done + 1, len(read))
+    real = [each.frame.image for each in read]
     plain = [expose(each, sensor.capture, np.random.default_rng(k)) for k, each in enumerate(light)]
     found = list(plain)
     halves = [np.arange(len(real))[k::2] for k in (0, 1)]
@@ -160,7 +160,7 @@ def calibrate_residual(
     shift_px = _shift_px(sensor, plain, found)
     spec = with_changes(sensor, response={"residual": residual.model_dump()})
     write_sensor(out, spec, f"With a residual network that was trained on {format_count(len(real), 'frames')} of {frames.name}.")
-    return TaughtResidual(spec, len(real), before, after, real_told, (psnr_db[0], psnr_db[1]), shift_px, read.refused, [out])
+    return TaughtResidual(spec, len(real), before, after, real_told, (psnr_db[0], psnr_db[1]), shift_px, refused, [out])
 
 
 def _shift_px(sensor: SensorSpec, first: list[ImageArray], second: list[ImageArray]) -> tuple[float, float]:

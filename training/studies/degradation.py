@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 from scenes import SensorSpec
 from twin.camera.capture import in_form
 from twin.evaluation.degradation.envelope import Envelope, evaluate_sweep
-from twin.evaluation.degradation.plan import SweepPlan
 from twin.evaluation.degradation.report import REPORT_FILES, write_report
 from twin.evaluation.degradation.shots import CONTACTS, RealSource, RenderedSource
-from twin.evaluation.degradation.study import check_pipelines, choose_pipelines, real_settings
+from twin.evaluation.degradation.study import SweepPlan, check_pipelines, choose_pipelines, real_settings
 from twin.evaluation.degradation.sweep import SweepSettings
 from twin.progress import Progress, silent, stage
 from twin.store import writes

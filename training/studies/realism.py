@@ -114,10 +114,10 @@ def compare_with_renders(
     spec = plain_of(sensor, without)
     disc, bar = lens_disc(spec.view, spec.housing), partial(stage, progress)
     with bar("read the real frames, find their pins") as step:
-        real = read_real(frames, spec, disc, limit=limit, fitted=fitted, lost=0.0 if pose_aligned else FEW_LOST, progress=step)
+        real, refused = read_real(frames, spec, disc, limit=limit, fitted=fitted, lost=0.0 if pose_aligned else FEW_LOST, progress=step)
     with bar("fit the skin to the pins, render") as step:
-        pairs = align_pins(spec, real.frames, disc, quality=quality, progress=step)
-    poses = align_poses(spec, real.frames, disc, quality=quality, bar=bar) if pose_aligned else None
+        pairs = align_pins(spec, real, disc, quality=quality, progress=step)
+    poses = align_poses(spec, real, disc, quality=quality, bar=bar) if pose_aligned else None
     with bar("measure caps, skin, noise, spectra") as step:
         found = statistics(pairs, disc, spec.pipeline.raw.polarity, progress=step)
     outcome: dict[str, TwoSample] = {}
@@ -130,7 +130,7 @@ def compare_with_renders(
         "frames": len(pairs),
         "fitted": fitted,
         "without": sorted(without),
-        "refused": real.refused,
+        "refused": refused,
         "disc": {"center_px": disc.center_px.tolist(), "radius_px": disc.radius_px},
         "pin_aligned": report.image_summary(pairs),
         "fixed_residual": fixed_residual(spec, pairs),

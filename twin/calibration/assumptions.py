@@ -124,7 +124,7 @@ def cost_of_assumptions(spec: SensorSpec, *, progress: Step | None = None) -> li
     for (assumed, change), (other, moves_pins) in changes.items():
         try:
             if moves_pins:  # the others leave the pins at rest where they are seen
-                other, _ = fit_camera(other, rest_px, named=True)
+                other, _ = fit_camera(other, rest_px)
             depth, tilt = ((estimate(displacements(other, PROBES)) - own) * np.sign(truth)).T
         except (ContactError, FrameError):
             continue

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares, linear_sum_assignment
-from scipy.spatial import cKDTree
+from scipy.optimize import least_squares
 
 from scenes.sensor import SensorSpec
 from twin.camera.projection import project
@@ -31,10 +30,8 @@ WORSE = 2.0
 ROBUST_PX = 1.0
 # Step of the numerical derivatives, as a share of the plausible range.
 STEP = 1e-4
-# Rounds of matching and fitting, and most steps of each fit.
-ROUNDS, MOST_STEPS = 6, 20
-# Turns that are tried, deg. A turn by 60 deg does not change a layout.
-TURNS_DEG = np.arange(-30.0, 30.0)
+# Most steps of a fit.
+MOST_STEPS = 20
 # Fewest pins that a camera is fitted to.
 LEAST_PINS = 20
 # Least distance of the pupil behind the window's back, mm.
@@ -106,9 +103,7 @@ class CameraReport:
     held: dict[str, str]
 
 
-def fit_camera(
-    spec: SensorSpec, pins_px: np.ndarray, *, free: tuple[str, ...] = FREE, named: bool = False
-) -> tuple[SensorSpec, CameraReport]:
+def fit_camera(spec: SensorSpec, pins_px: np.ndarray, *, free: tuple[str, ...] = FREE) -> tuple[SensorSpec, CameraReport]:
     """Least squares of camera and pin pattern on the caps' projections through the window.
 
     Parameters
@@ -116,11 +111,9 @@ def fit_camera(
     spec : SensorSpec
         The start of the fit, and the values of all parameters that are not free. The ratio of ``fy_px`` to ``fx_px`` is kept.
     pins_px : (N, 2) float
-        Raw-frame px of a no-contact frame, in any order; NaN where not found.
+        Raw-frame px of a no-contact frame, in the specification's order; NaN where not found.
     free : tuple of str
         Of ``PARAMETERS``.
-    named : bool
-        The pins are in the specification's order: they keep it.
 
     Returns
     -------
@@ -130,62 +123,33 @@ def fit_camera(
     Raises
     ------
     FrameError
-        A parameter is unknown, or there are too few pins.
+        There are too few pins.
     """
-    if unknown := set(free) - set(PARAMETERS):
-        raise FrameError(f"{sorted(unknown)[0]} is not a parameter of the camera's fit; choose from {', '.join(PARAMETERS)}")
-    pins_px = np.asarray(pins_px, float).reshape(-1, 2)
-    seen = np.flatnonzero(np.isfinite(pins_px).all(axis=1))
-    pins_px = pins_px[seen]
-    if not LEAST_PINS <= len(pins_px) <= spec.pins.count:
-        raise FrameError(
-            f"{len(pins_px)} of {spec.pins.count} pins found; between {LEAST_PINS} and all are needed: give another no-contact frame"
-        )
+    count = int(np.isfinite(pins_px).all(axis=1).sum())
+    if count < LEAST_PINS:
+        raise FrameError(f"{count} of {spec.pins.count} pins found; {LEAST_PINS} or more are needed: give another no-contact frame")
     names, held = [name for name in PARAMETERS if name in free], {}
-    order = seen if named else nearest_order(spec, pins_px)
-    found, order, residual, slopes = _fit_camera(spec, pins_px, order, names, rematch=not named)
+    found, residual, slopes = _fit_camera(spec, pins_px, names)
     needed: set[str] = set()
     while True:
         sd, correlation = _certainty(residual, slopes)
         rings = len(spec.pins.shape.ring_ends()) - 1
-        rings = rings if rings > 1 else np.sqrt(len(pins_px) / 3)  # as many as rings of so many pins
-        alike = np.sqrt(len(pins_px) / rings)  # the pins of a ring share one error
+        rings = rings if rings > 1 else np.sqrt(count / 3)  # as many as rings of so many pins
+        alike = np.sqrt(count / rings)  # the pins of a ring share one error
         doubtful = _list_undetermined(_values(spec, names), sd * alike * max(MODEL_PX / max(_rms(residual), 1e-9), 1), correlation)
         name = next((name for name in names if name in doubtful and name not in needed), None)
         if name is None:
             break
         others = [other for other in names if other != name]
-        without = _fit_camera(spec, pins_px, order, others, rematch=not named) if others else None
-        if without is None or _rms(without[2]) > WORSE * max(_rms(residual), MODEL_PX):
+        without = _fit_camera(spec, pins_px, others) if others else None
+        if without is None or _rms(without[1]) > WORSE * max(_rms(residual), MODEL_PX):
             needed.add(name)  # its value is uncertain, but the specification's is far off
             continue
         held[name] = doubtful[name]
-        names, (found, order, residual, slopes) = others, without
+        names, (found, residual, slopes) = others, without
     fitted = _with(spec, dict(zip(names, found.tolist(), strict=True)))
     spec = with_changes(spec, camera=fitted.camera.model_dump(), pins=fitted.pins.model_dump())
-    return spec, CameraReport(_rms(residual), len(pins_px), dict(zip(names, sd.tolist(), strict=True)), held)
-
-
-def nearest_order(spec: SensorSpec, pins_px: np.ndarray) -> np.ndarray:
-    """Indices (n,) in the specification of pins (n, 2), independent of the camera's place, scale and turn.
-
-    The projected caps are given the centre and the size of the pins, turned to the best fit, and assigned.
-    """
-    best_miss, best = np.inf, np.zeros((0, 2))
-    for turn in sorted(TURNS_DEG, key=abs):
-        ours = project(spec.view, rest_pins(_with(spec, {"phase_deg": spec.pins.phase_deg + turn}).geometry).caps_mm)
-        middle, size = ours.mean(axis=0), np.sqrt(np.mean(np.sum((ours - ours.mean(axis=0)) ** 2, axis=1)))
-        center = pins_px.mean(axis=0)
-        laid = (ours - middle) / size * np.sqrt(np.mean(np.sum((pins_px - center) ** 2, axis=1))) + center
-        miss = float(np.mean(cKDTree(laid).query(pins_px)[0]))
-        if miss < best_miss - 1e-9:
-            best_miss, best = miss, laid
-    return _assign_caps(pins_px, best)
-
-
-def _assign_caps(pins_px: np.ndarray, caps_px: np.ndarray) -> np.ndarray:
-    """Indices (n,) of different caps for all pins, with the least sum of squared distances."""
-    return linear_sum_assignment(np.sum((pins_px[:, None] - caps_px) ** 2, axis=2))[1]
+    return spec, CameraReport(_rms(residual), count, dict(zip(names, sd.tolist(), strict=True)), held)
 
 
 def _with(spec: SensorSpec, values: dict[str, float]) -> SensorSpec:
@@ -209,40 +173,26 @@ def _range(name: str, value: float) -> float:
     return parameter.plausible * (value if parameter.relative else 1.0)
 
 
-def _fit_camera(
-    spec: SensorSpec, pins_px: np.ndarray, order: np.ndarray, names: list[str], *, rematch: bool = True
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Match and fit alternately. Returns values (p,), order (n,), residual (2 n,) px and its derivatives (2 n, p) by the values."""
+def _fit_camera(spec: SensorSpec, pins_px: np.ndarray, names: list[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Values (p,) fitted to the pins (N, 2), residual (2 n,) px of the n found ones, and its derivatives (2 n, p) by the values."""
     known = _values(spec, names)
-    start = np.array(list(known.values()))
     ranges = np.array([_range(name, value) for name, value in known.items()])
     low, high = np.array([PARAMETERS[name].bounds for name in names]).T.copy()
     if "distance_mm" in names:
         low[names.index("distance_mm")] = -spec.lens.back_mm + BEHIND_WINDOW_MM
+    seen = np.isfinite(pins_px).all(axis=1)
 
-    def caps_px(values: np.ndarray) -> np.ndarray:
+    def residual(values: np.ndarray) -> np.ndarray:
         trial = _with(spec, dict(zip(names, values.tolist(), strict=True)))
-        return project(trial.view, rest_pins(trial.geometry).caps_mm)
+        return (project(trial.view, rest_pins(trial.geometry).caps_mm) - pins_px)[seen].ravel()
 
-    def residual(values: np.ndarray, order: np.ndarray) -> np.ndarray:
-        return (caps_px(values)[order] - pins_px).ravel()
-
-    def slopes(values: np.ndarray, order: np.ndarray) -> np.ndarray:
+    def slopes(values: np.ndarray) -> np.ndarray:
         steps = STEP * ranges * np.eye(len(ranges))
-        return np.column_stack([(residual(values + d, order) - residual(values - d, order)) / (2 * np.abs(d).max()) for d in steps])
+        return np.column_stack([(residual(values + d) - residual(values - d)) / (2 * np.abs(d).max()) for d in steps])
 
-    values = start
-    for _ in range(ROUNDS):
-        before = order
-        first = np.clip(values, low, high)
-        values = least_squares(
-            residual, first, slopes, (low, high), x_scale=ranges, loss="soft_l1", f_scale=ROBUST_PX, max_nfev=MOST_STEPS, args=(order,)
-        ).x
-        if rematch:
-            order = _assign_caps(pins_px, caps_px(values))
-        if np.array_equal(order, before):
-            break
-    return values, order, residual(values, before), slopes(values, before)
+    start = np.clip(list(known.values()), low, high)
+    values = least_squares(residual, start, slopes, (low, high), x_scale=ranges, loss="soft_l1", f_scale=ROBUST_PX, max_nfev=MOST_STEPS).x
+    return values, residual(values), slopes(values)
 
 
 def _rms(residual: np.ndarray) -> float:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.distance import cosine
 
 from scenes.sensor import SensorSpec
 from twin.calibration.sensor_file import write_sensor
@@ -82,7 +83,7 @@ def registered_view(
         if np.linalg.norm(moved) < LEAST_MOVED * nominal.spacing_px.mean():
             raise FrameError(f"{frame.name}: the push {side} hardly moves the pins; press firmly, then move the object by 2 mm or more")
         along = SIDES[side][0] * x + SIDES[side][1] * y
-        fit += [_cosine(view.matrix @ along, moved) - 1 for view in views]
+        fit += [-cosine(view.matrix @ along, moved) for view in views]
     if twist is not None:
         away, moved = rest_px - rest_px.mean(axis=0), _pin_motions(pipeline, twist)
         turned = float(np.nansum(cross_plane(away, moved)) / np.sum(away**2))
@@ -151,7 +152,3 @@ def _with_view(spec: SensorSpec, form: Form, view: PinView, rest_px: np.ndarray)
     blob = getattr(_with_mask(spec, form, rest_px[known]).pipeline, form).model_dump()
     blob |= {"rest_px": tuple(map(tuple, places.tolist())), "rest_origin": "measured"}
     return with_changes(turned, pipeline={str(form): blob})
-
-
-def _cosine(a: np.ndarray, b: np.ndarray) -> float:
-    return float(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)))

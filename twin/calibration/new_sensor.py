@@ -89,8 +89,6 @@ class Health:
         Mean share of the pins in view that are found.
     valid : float
         Share of valid frames.
-    extra : float
-        Median number of pin-like spots that belong to no pin.
     steadily_lost : tuple of int
         Pins that are lost in at least half of the frames although they should be in view.
     reasons : tuple of str
@@ -101,7 +99,6 @@ class Health:
     all_pins: float
     found: float
     valid: float
-    extra: float
     steadily_lost: tuple[int, ...]
     reasons: tuple[str, ...]
 
@@ -371,7 +368,7 @@ def _camera(
             nearer = {key: getattr(start.camera, key) * FISHEYE_MM / PINHOLE_MM for key in ("fx_px", "fy_px", "distance_mm")}
             trial = trial.alter(camera=nearer)
         trial = trial.alter(camera=camera_seeing(trial, pins_px, np.flatnonzero(np.isfinite(pins_px[:, 0]))))
-        fitted, report = fit_camera(trial, pins_px, free=free, named=True)
+        fitted, report = fit_camera(trial, pins_px, free=free)
         fitted, uneven = _with_sizes(fitted, sizes_px)
         misfit = float(np.hypot(report.rms_px / sd_px, uneven / SIZE_SD))
         tried.append((misfit, fitted, report))
@@ -433,7 +430,6 @@ def _health(sensor: SensorSpec, form: Form, frames: list[Frame], folder: Path) -
     first = [next(f"{f.name}: {o.reason}" for f, o in zip(frames, seen, strict=True) if o.reason.startswith(r)) for r in reasons]
     found = [o.found / max(o.expected, 1) for o in seen]
     whole, mean, valid = (float(np.mean(share)) for share in ([o.complete for o in seen], found, [o.valid for o in seen]))
-    extra = float(np.median([len(o.extra_px) for o in seen]))
     worst = np.argsort(found, kind="stable")
     chosen = dict.fromkeys([int(worst[-1]), int(worst[0]), *worst[:: max(len(worst) // SHOWN_FRAMES, 1)].tolist()])
     scale = int(np.clip(round(900 / max(pipeline.size_px)), 1, 6))  # pins can be seen well
@@ -441,7 +437,7 @@ def _health(sensor: SensorSpec, form: Form, frames: list[Frame], folder: Path) -
         write_image(folder / f"overlay-{number}.png", draw_overlay(frames[k], seen[k], scale=scale, numbers=True))
         for number, k in enumerate(list(chosen)[:SHOWN_FRAMES], 1)
     ]
-    return Health(len(seen), whole, mean, valid, extra, tuple(steadily.tolist()), tuple(first[:3])), pictures
+    return Health(len(seen), whole, mean, valid, tuple(steadily.tolist()), tuple(first[:3])), pictures
 
 
 def _doubtful(camera: CameraReport, rest: Rest, frames: int) -> list[str]:

@@ -15,16 +15,18 @@ from scenes.sensor import SensorSpec
 from twin.calibration.camera_pose import fit_camera
 from twin.calibration.details import fit_details, undetermined_tiles
 from twin.calibration.light.caps import fit_caps
+from twin.calibration.light.leds import fit_reflections, turn_leds
 from twin.calibration.light.photometry import fit_photometry
 from twin.calibration.light.response import fit_blur, fit_focus, fit_haze, fit_noise, fit_response, sharpness
-from twin.calibration.light.ring import NoRing, fit_rim
-from twin.calibration.light.surroundings import fit_surroundings
+from twin.calibration.light.ring import NoRing, fit_disc_edge, fit_rim, fit_ring
+from twin.calibration.light.specks import fit_specks
+from twin.calibration.light.still import Still, median_still
 from twin.calibration.sensor_file import sibling_folder, write_sensor
 from twin.camera.capture import expose
 from twin.camera.projection import lens_disc
 from twin.errors import FrameError, format_count
 from twin.evaluation.pictures.aligned import Aligned, read_frames, with_changes
-from twin.evaluation.pictures.images import compare_images, difference_picture
+from twin.evaluation.pictures.compare import compare_images, difference_picture
 from twin.evaluation.pictures.report import image_columns
 from twin.frames import distinct_stems
 from twin.frames.images import read_image, write_image
@@ -33,7 +35,7 @@ from twin.optics.relief import DETAILS, without
 from twin.optics.render import Renderer
 from twin.pins.labelling.rest import require_even
 from twin.pins.pipeline import Pipeline
-from twin.progress import Bar, Progress, Step, report_each, silent, stage
+from twin.progress import Bar, Progress, Step, report_each, silent, stage, unheard
 from twin.report.page import Page, PagePicture, code
 from twin.report.table import Column
 from twin.store import KEPT, Item, inputs_digest, kept_arrays, kept_json, output, writes_file
@@ -49,6 +51,10 @@ DETAIL_ROUNDS = 3
 """Rounds in which the response is fitted to renders with details, and the details are fitted again."""
 HAZE_SIGMA_PX = 40.0
 """Width of the haze, px, at the start of the fit if the specification has no haze."""
+MOST_BINARY = 0.6
+"""Share of pixels at exactly 0 or 255 above which frames count as thresholded. Raw frames are saturated only on the ring."""
+MOST_STILL = 40
+"""Most frames of which the still picture is the median, spread evenly. More frames do not improve it."""
 LONGEST = 12
 """Length of the longest list whose numbers the page shows. Of longer lists it shows only the length."""
 KINDS = {"real": "real", "before": "before", "after": "after", "residual": "what is left, twice amplified about middle gray"}
@@ -281,6 +287,43 @@ def _stages(frames: list[Aligned], inside: np.ndarray, studio: _Studio, bar: Bar
 
     smooth = [surroundings, photometry, caps, response, defocus, *[caps, response] * (CAP_ROUNDS - 1), rim]
     return [*smooth, details, *[detailed_response, details] * DETAIL_ROUNDS, noise]
+
+
+def fit_surroundings(spec: SensorSpec, images: np.ndarray, pins_px: np.ndarray, progress: Step = unheard) -> SensorSpec:
+    """The specification with all that contact does not change: disc edge, ring, LED places and reflections, and specks.
+
+    They are fitted to the per-pixel median of the frames, whose gray levels are converted to light by the known response curve.
+
+    Parameters
+    ----------
+    spec : SensorSpec
+        Camera, response, ``leds.power``, ``leds.balance`` and ``gel.haze`` are known and not changed.
+    images : (M, H, W, 3) or (M, H, W) uint8
+        Raw frames with different contacts, RGB or gray.
+    pins_px : (M, N, 2) float
+        Pins in raw-frame px; NaN if not found.
+    progress : callable, optional
+        Called with (done, total).
+
+    Raises
+    ------
+    FrameError
+        The frames are thresholded, or show no bright ring around the disc (`NoRing`).
+    """
+    if np.mean((images == 0) | (images == 255)) > MOST_BINARY:
+        raise FrameError(
+            f"the frames of {spec.name} are thresholded: they have no gray levels, from which the light of the surroundings could be "
+            "fitted; give raw camera frames, or keep the specification's housing and leds"
+        )
+    chosen = np.unique(np.linspace(0, len(images) - 1, min(len(images), MOST_STILL)).astype(int))
+    images, pins_px = images[chosen], pins_px[chosen]
+    images = np.repeat(images[..., None], 3, axis=3) if images.ndim == 3 else images
+    still = median_still(spec, images)
+    specks = partial(fit_specks, images=images, pins_px=pins_px)
+    fits: tuple[Callable[[SensorSpec, Still], SensorSpec], ...] = (fit_disc_edge, turn_leds, fit_reflections, fit_ring, specks)
+    for fit in report_each(fits, progress):
+        spec = fit(spec, still)
+    return spec
 
 
 def _mean_figures(frames: list[Aligned], shots: list[np.ndarray], inside: np.ndarray) -> dict[str, float]:

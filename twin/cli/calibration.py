@@ -427,7 +427,7 @@ def robustness(
           --pipeline mine.toml --pipeline mine.py:my_pins --out out/mine
     """
     from training.studies import degradation
-    from twin.evaluation.degradation.plan import SweepPlan, load_plan
+    from twin.evaluation.degradation.study import SweepPlan, load_plan
 
     sweep = load_if_named(load_plan, conditions) or SweepPlan()
     return degradation.run(call(degradation.DegradationPlan, locals()), out, progress=progress)

@@ -20,9 +20,7 @@ from scenes.randomisation import FrictionSpread
 from training.data.audit import LabelColumns
 from training.errors import TrainingError
 from training.runs.gaussian_process import CONSTANT_AND_SMOOTH, Kernel, Points, Posterior, likeliest
-from twin.calibration.contact.fit import expect, mean_squared, simulate
-from twin.calibration.contact.parameters import PARAMETERS
-from twin.calibration.contact.simulate import CalibrationSetup
+from twin.calibration.contact.fit import PARAMETERS, CalibrationSetup, expect, mean_squared
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.progress import Step, unheard
 from twin.rig.kinematics import rig_of
@@ -122,7 +120,7 @@ def measure_residuals(
     setup = replace(setup, parameters=(FRICTION,))
     if not any(label.move.any() for label in labels):
         frictions = (rig_of(setup.sensor).friction,)
-    moved = simulate(setup, measured, [[np.log(friction)] for friction in frictions], rig_of(setup.sensor).turn_sign, progress)
+    moved = setup.simulate(measured, [[np.log(friction)] for friction in frictions], rig_of(setup.sensor).turn_sign, progress)
     moved, friction, friction_px = _likeliest(moved, real_px, frictions)
     weights = expect(mean_squared(moved, real_px))
     good = np.flatnonzero(np.isfinite(moved).all(axis=(1, 2, 3)) & (weights.trust > TRUSTED))

@@ -25,7 +25,7 @@ from training.studies.sim_to_real.discrepancy import Discrepancy, Residuals, mea
 from training.studies.sim_to_real.model_inversion import READ, TwinRead, named_labels, read_row, read_twin
 from training.studies.sim_to_real.steps import BOTH, EVENLY, REAL, WITHOUT, SimToRealPlan
 from twin.calibration.contact import fit_contact
-from twin.calibration.contact.simulate import CalibrationSetup
+from twin.calibration.contact.fit import CalibrationSetup
 from twin.estimate import readable_labels
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.progress import Progress, Step, silent, stage, unheard
@@ -209,7 +209,7 @@ def _prepare(plan: SimToRealPlan, out: Path, progress: Progress) -> Ground:
     few = real.rows(chosen.few)
     measured = steps.measured_of(few)
     setup = CalibrationSetup(
-        plan.sensor, plan.experiment, plan.target_object, measured.form, plan.across, out / "calibration", plan.workers
+        plan.sensor, plan.experiment, plan.target_object, plan.across, measured.form, out / "calibration", workers=plan.workers
     )
     if plan.calibrate:
         with stage(progress, "calibration") as step:

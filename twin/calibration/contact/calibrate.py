@@ -11,12 +11,10 @@ from scenes import load_object
 from scenes.experiment import ExperimentSpec
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
-from twin.calibration.contact.fit import before_and_after, fit_contact, held_out_px
+from twin.calibration.contact.fit import PARAMETERS, CalibrationSetup, before_and_after, fit_contact, held_out_px
 from twin.calibration.contact.forces import FILES, FORCE_PARAMETERS, ForceComparison, ForceSetup, compare_table, is_table
 from twin.calibration.contact.newtons import MOST_PRESSES, Newtons, assume_stiffness, compare_forces, pressed_n
-from twin.calibration.contact.parameters import PARAMETERS
 from twin.calibration.contact.report import summary_of, write_calibration
-from twin.calibration.contact.simulate import CalibrationSetup
 from twin.calibration.sensor_file import sibling_folder, write_sensor
 from twin.errors import OptionError
 from twin.evaluation.labelled.model import MeasuredFrames, measure_frames
@@ -145,7 +143,7 @@ def calibrate_to_file(
     of_pins, of_forces = (tuple(each for each in every if each.name not in hold) for every in (PARAMETERS, FORCE_PARAMETERS))
     obj = obj or load_object(experiment.object)
     if is_table(frames):
-        table = ForceSetup(sensor, experiment, obj, across, workers, of_forces)
+        table = ForceSetup(sensor, experiment, obj, across, workers=workers, parameters=of_forces)
         with output(folder, *FILES):
             forces = compare_table(frames, table, folder, columns, labels, seed, progress)
         write_sensor(out, forces.sensor, "\n".join([f"Contact fitted to {frames.name}, starting from {sensor.name}.", *forces.lines()]))
@@ -155,7 +153,7 @@ def calibrate_to_file(
         order = np.random.default_rng(seed).permutation(len(measured))  # the frames come in the order of the recording's table
         fitted, held = _part(measured, np.sort(order[:labels])), _part(measured, np.sort(order[labels:]))
         spec = sensor.alter(rig=rig_of(sensor, obj.name))
-        setup = CalibrationSetup(spec, experiment, obj, measured.form, across, folder / "contacts", workers, of_pins)
+        setup = CalibrationSetup(spec, experiment, obj, across, measured.form, folder / "contacts", workers=workers, parameters=of_pins)
         fit = fit_contact(setup, fitted, progress=step)
         error = held_out_px(setup, fit, held, progress=step) if len(held) else None
         newtons = scale_forces(frames, fit.sensor, experiment, obj, seed, across=across, form=form)

@@ -1,4 +1,4 @@
-"""Fit of the contact to labelled frames when it is unknown whether each frame's move was executed.
+"""Fit of the contact to labelled frames when it is unknown whether each frame's move was executed: parameters, simulation, search.
 
 d_k1 and d_k0 are the mean squared pin errors of frame k after the move and after the tap alone, s^2 the median squared error, w the share
 of executed moves, and theta the parameters with their prior:
@@ -15,22 +15,39 @@ minus simulated displacements. Therefore errors and slopes are taken relative to
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
 from itertools import product
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
+from pydantic import ValidationError
 
+from scenes.experiment import ExperimentSpec
+from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
-from twin.calibration.contact.parameters import values_of, with_quantities
-from twin.calibration.contact.simulate import CalibrationSetup
-from twin.errors import FrameError
-from twin.evaluation.labelled.model import MeasuredFrames
+from twin.calibration.size import of_radius
+from twin.errors import ContactError, FrameError
+from twin.evaluation.labelled.model import ContactModel, MeasuredFrames
 from twin.frames.forms import blob_spec
 from twin.progress import Step, unheard
-from twin.rig.kinematics import rig_of
+from twin.rig.kinematics import TURNING, rig_of
+from twin.rig.labels import ArmLabel
+from twin.store import Item, find_arrays, inputs_digest, keep_arrays
 from twin.types import Form
+from twin.workers import in_processes
 
+LEAST = 1e-3
+"""Least number of which a logarithm is computed; for a Poisson's ratio nu the least 1 - 2 nu."""
+
+DETERMINED = 0.5
+"""Least share of a parameter's prior variance that the data must remove for it to count as determined."""
+Z90 = 1.645
+"""Half a 90 % interval of the normal distribution, in standard deviations."""
+SIZE = "skin.outer_radius_mm"
+"""Key of the radius of a dome. If it is fitted, all lengths of the sensor and its rig are scaled with it (see ``of_radius``) before the
+other parameters are set."""
 INDEPENDENT = 6.0
 """n above: the number of modes that contain nearly all of the displacement."""
 ROUNDS = 3
@@ -51,6 +68,196 @@ LEAST_PX2 = 0.01
 """Least variance of a pin's place, px^2: the precision of the measurement."""
 SMALLEST_SHARE, LARGEST_SHARE = 0.05, 0.95
 """Bounds of the share of executed moves, so that its logarithm stays finite."""
+
+
+@dataclass(frozen=True)
+class FittedParameter:
+    """One number of a sensor's specification that is fitted.
+
+    Attributes
+    ----------
+    name : str
+        Dotted key. Of ``rig.turn_offset_deg`` only the turn in the plane of approach and across is fitted.
+    prior : float
+        Prior standard deviation of the fitted quantity around its start.
+    step : float
+        Step of the fitted quantity for difference quotients.
+    scale : {"plain", "log", "volume"}
+        The fitted quantity: the number itself, its logarithm, or, for a Poisson's ratio nu, log(1 - 2 nu), which measures how
+        compressible the volume is.
+    least : float
+        Smallest meaningful number. If the fitted quantity is below it, the number is ``least``.
+    """
+
+    name: str
+    prior: float
+    step: float
+    scale: Literal["plain", "log", "volume"] = "plain"
+    least: float = -np.inf
+
+    def fitted_quantity(self, number: float) -> float:
+        """The fitted quantity that belongs to a number of the specification."""
+        if self.scale == "plain":
+            return number
+        return float(np.log(max(number if self.scale == "log" else 1 - 2 * number, LEAST)))
+
+    def number(self, fitted: float) -> float:
+        """The number of the specification that belongs to a fitted quantity."""
+        if self.scale == "plain":
+            return max(float(fitted), self.least)
+        return float(np.exp(fitted) if self.scale == "log" else (1 - np.exp(fitted)) / 2)
+
+    def slope(self, fitted: float) -> float:
+        """Absolute change of the number for a change of the fitted quantity by 1."""
+        return 1.0 if self.scale == "plain" else float(np.exp(fitted)) / (1 if self.scale == "log" else 2)
+
+
+PARAMETERS = (
+    FittedParameter("rig.contact_offset_mm", 0.5, 0.05),
+    FittedParameter("rig.tcp_to_dome_mm", 10.0, 0.5),
+    FittedParameter("rig.tcp_lateral_mm", 2.0, 0.2),
+    FittedParameter("rig.turn_offset_deg", 3.0, 0.3),
+    FittedParameter("rig.plate_tilt_deg", 2.0, 0.3),
+    FittedParameter("rig.image_turn_deg", 10.0, 1.0),
+    FittedParameter("rig.friction", 0.7, 0.15, "log"),
+    FittedParameter("rig.compliance_mm_per_n", 0.1, 0.02, least=0.0),
+    FittedParameter("rig.turn_compliance_deg_per_n", 0.3, 0.1),
+    FittedParameter("gel.young_modulus_mpa", 0.7, 0.15, "log"),
+    FittedParameter("gel.poisson_ratio", 0.7, 0.3, "volume"),
+    FittedParameter("skin.thickness_mm", 0.2, 0.05),
+    FittedParameter("pins.length_mm", 0.3, 0.1, "log"),
+)
+
+
+@dataclass(frozen=True)
+class FittedContacts:
+    """What all contacts of a fit have in common.
+
+    Attributes
+    ----------
+    sensor : SensorSpec
+        The sensor at the start of the fit.
+    experiment : ExperimentSpec
+        The experiment that the contacts were recorded with.
+    obj : ObjectSpec
+    across : int
+        Elements along each side of the skin's grid.
+    workers : int
+        Number of processes.
+    parameters : tuple of FittedParameter
+        The fitted parameters.
+    """
+
+    sensor: SensorSpec
+    experiment: ExperimentSpec
+    obj: ObjectSpec
+    across: int
+    workers: int = field(default=1, kw_only=True)
+    parameters: tuple[FittedParameter, ...] = field(default=PARAMETERS, kw_only=True)
+
+    @property
+    def quantities(self) -> np.ndarray:
+        """Fitted quantities (P,) of the sensor's parameters."""
+        plain = self.sensor.model_dump(include={"gel", "skin", "pins"}) | {"rig": rig_of(self.sensor).model_dump()}
+        turning = TURNING[self.experiment.approach] - 3
+        out = []
+        for parameter in self.parameters:
+            section, key = parameter.name.split(".")
+            value = plain[section][key]
+            out.append(parameter.fitted_quantity(value[turning] if key == "turn_offset_deg" else value))
+        return np.array(out)
+
+    def sensor_with(self, quantities: np.ndarray, turn_sign: int) -> SensorSpec:
+        """The sensor with other fitted quantities (P,) of the parameters.
+
+        Raises
+        ------
+        ValidationError
+            The quantities do not make a valid sensor.
+        """
+        sensor, pairs = self.sensor, list(zip(self.parameters, quantities, strict=True))
+        for parameter, value in pairs:
+            if parameter.name == SIZE:
+                sensor = of_radius(sensor.alter(rig=rig_of(sensor)), parameter.number(value))
+        plain = sensor.model_dump(mode="json") | {"rig": rig_of(sensor).model_dump(mode="json")}
+        plain["rig"]["turn_sign"] = int(turn_sign)
+        for parameter, value in pairs:
+            section, key = parameter.name.split(".")
+            if key == "turn_offset_deg":
+                plain[section][key][TURNING[self.experiment.approach] - 3] = parameter.number(value)
+            else:
+                plain[section][key] = parameter.number(value)
+        return SensorSpec.model_validate(plain)
+
+
+@dataclass(frozen=True)
+class CalibrationSetup(FittedContacts):
+    """The contacts of a calibration. Each is stored on disk as soon as it is simulated.
+
+    Attributes
+    ----------
+    form : Form
+        Form of the frames, in whose px the displacements are.
+    folder : Path
+        Folder for the simulated contacts.
+    """
+
+    form: Form
+    folder: Path
+
+    def displacements(self, jobs: list[tuple], labels: list[ArmLabel], progress: Step = unheard) -> np.ndarray:
+        """(J, 2, N, 2) px after tap and after move, for jobs of (values (P,), turn_sign, row of ``labels``); NaN if the contact failed."""
+        shared = inputs_digest(replace(self, folder=Path(), workers=1))
+        moves = [ArmLabel(label.pose, label.move) for label in labels]  # as if they had been executed
+        tasks = [(k, np.asarray(values, float), int(sign), moves[row]) for k, (values, sign, row) in enumerate(jobs)]
+        items = [Item("contact", (__name__,), [shared, *task[1:]]) for task in tasks]
+        found = {k: kept["displacements_px"] for k, item in enumerate(items) if (kept := find_arrays(self.folder, item)) is not None}
+        todo = [task for task in tasks if task[0] not in found]
+        for k, both in in_processes(partial, (_contact, self), todo, processes=self.workers):
+            keep_arrays(self.folder, items[k], {"displacements_px": both})
+            found[k] = both
+            progress(len(found), len(items))
+        return np.stack([found[k] for k in range(len(items))])
+
+    def simulate(self, measured: MeasuredFrames, values: list, sign: int, progress: Step = unheard) -> np.ndarray:
+        """(V, M, 2, N, 2) px of measured frames for V vectors of values."""
+        jobs = [(each, sign, row) for each in values for row in range(len(measured))]
+        return self.displacements(jobs, measured.labels, progress).reshape(len(values), len(measured), 2, -1, 2)
+
+    def slopes(self, measured: MeasuredFrames, value: np.ndarray, sign: int, moved: np.ndarray, progress: Step) -> np.ndarray:
+        """Derivatives (P, M, 2, N, 2) of the displacements by each fitted quantity, px; 0 for a failed contact."""
+        steps = np.diag([p.step for p in self.parameters])
+        there = self.simulate(measured, [value + step for step in steps], sign, progress)
+        return np.nan_to_num((there - moved) / np.diag(steps)[:, None, None, None, None])
+
+
+def _contact(setup: CalibrationSetup, task: tuple[int, np.ndarray, int, ArmLabel]) -> tuple[int, np.ndarray]:
+    number, values, sign, label = task
+    try:
+        return number, np.stack(_model(setup, tuple(values.tolist()), sign).displacements_px(label))
+    except (ContactError, ValidationError):
+        return number, np.full((2, setup.sensor.pins.count, 2), np.nan)
+
+
+@lru_cache(maxsize=4)
+def _model(setup: CalibrationSetup, values: tuple[float, ...], sign: int) -> ContactModel:
+    return ContactModel(setup.sensor_with(np.array(values), sign), setup.experiment, setup.obj, setup.form, across=setup.across)
+
+
+@dataclass(frozen=True)
+class Weights:
+    """The E-step's result for M frames."""
+
+    executed: np.ndarray
+    trust: np.ndarray
+    share: float
+    variance_px2: float
+
+    def cost(self, squared_px2: np.ndarray) -> float:
+        """Cost of squared errors (M, 2), after tap and after move. A failed contact (NaN) has no cost."""
+        squared = np.nan_to_num(squared_px2)
+        each = (1 - self.executed) * squared[:, 0] + self.executed * squared[:, 1]
+        return float(INDEPENDENT / self.variance_px2 * self.trust @ each)
 
 
 @dataclass(frozen=True)
@@ -91,22 +298,6 @@ class ContactFit:
     rest_px: np.ndarray
 
 
-@dataclass(frozen=True)
-class Weights:
-    """The E-step's result for M frames."""
-
-    executed: np.ndarray
-    trust: np.ndarray
-    share: float
-    variance_px2: float
-
-    def cost(self, squared_px2: np.ndarray) -> float:
-        """Cost of squared errors (M, 2), after tap and after move. A failed contact (NaN) has no cost."""
-        squared = np.nan_to_num(squared_px2)
-        each = (1 - self.executed) * squared[:, 0] + self.executed * squared[:, 1]
-        return float(INDEPENDENT / self.variance_px2 * self.trust @ each)
-
-
 def fit_contact(setup: CalibrationSetup, measured: MeasuredFrames, *, progress: Step = unheard) -> ContactFit:
     """Fit the setup's parameters and the sign of the turns.
 
@@ -121,15 +312,15 @@ def fit_contact(setup: CalibrationSetup, measured: MeasuredFrames, *, progress: 
     start, sign = _start(setup, measured, target, progress)
     prior = np.array([p.prior for p in setup.parameters])
     value, moved, weights = _search_values(setup, measured, target, start, sign, progress)
-    slopes = _slopes(setup, measured, value, sign, moved, progress)
+    slopes = setup.slopes(measured, value, sign, moved, progress)
     seen_at_rest = measured.at_rest_seen
     shift = np.zeros_like(measured.no_contact_px) if seen_at_rest else _mean(target[:, None] - moved, weights)
     matrix, _ = _normal(slopes, target[:, None] - moved, weights, seen_at_rest)
     covariance = np.linalg.inv(matrix + np.diag(prior**-2))
     sd = np.sqrt(np.diag(covariance))
-    shipped = values_of(setup.sensor, setup.experiment, setup.parameters)
-    first = simulate(setup, measured, [shipped], rig_of(setup.sensor).turn_sign, progress)[0]
-    sensor, rest_px = with_quantities(setup.sensor, setup.experiment, value, sign, setup.parameters), measured.no_contact_px + shift
+    shipped = setup.quantities
+    first = setup.simulate(measured, [shipped], rig_of(setup.sensor).turn_sign, progress)[0]
+    sensor, rest_px = setup.sensor_with(value, sign), measured.no_contact_px + shift
     sensor = sensor if seen_at_rest else at_rest(sensor, measured.form, rest_px)
     determined, correlation = 1 - (sd / prior) ** 2, covariance / np.outer(sd, sd)
     before_px, after_px = likelier_px(first, target), likelier_px(moved, target - shift)
@@ -144,7 +335,7 @@ def _search_values(
     prior = np.array([p.prior for p in setup.parameters])
     value = start.copy()
     seen_at_rest = measured.at_rest_seen
-    moved = simulate(setup, measured, [value], sign, progress)[0]
+    moved = setup.simulate(measured, [value], sign, progress)[0]
     weights = expect(mean_squared(moved, target if seen_at_rest else target - np.nanmedian(target - moved[:, 1], axis=0)))
 
     def squared_of(displacements: np.ndarray) -> np.ndarray:
@@ -152,13 +343,13 @@ def _search_values(
         return mean_squared(displacements, target - shift)
 
     def cost(tried: np.ndarray, weights: Weights, solved: int) -> tuple[float, np.ndarray]:
-        there = simulate(setup, measured, [tried], sign, progress)[0]
+        there = setup.simulate(measured, [tried], sign, progress)[0]
         squared = squared_of(there)
         fewer = np.isfinite(squared).sum() < solved
         return np.inf if fewer else weights.cost(squared) + float(np.sum(((tried - start) / prior) ** 2)), there
 
     for _ in range(ROUNDS):
-        slopes = _slopes(setup, measured, value, sign, moved, progress)
+        slopes = setup.slopes(measured, value, sign, moved, progress)
         matrix, force = _normal(slopes, target[:, None] - moved, weights, seen_at_rest)
         step = np.linalg.solve(matrix + np.diag(prior**-2), force + (start - value) / prior**2)
         squared = squared_of(moved)
@@ -197,7 +388,7 @@ def held_out_px(setup: CalibrationSetup, fit: ContactFit, measured: MeasuredFram
 def before_and_after(setup: CalibrationSetup, fit: ContactFit, measured: MeasuredFrames, progress: Step = unheard) -> np.ndarray:
     """(2, M, 2, N, 2) px with the values at the start and at the end of a fit."""
     ends = ((fit.start, rig_of(setup.sensor).turn_sign), (fit.value, rig_of(fit.sensor).turn_sign))
-    return np.stack([simulate(setup, measured, [values], sign, progress)[0] for values, sign in ends])
+    return np.stack([setup.simulate(measured, [values], sign, progress)[0] for values, sign in ends])
 
 
 def likelier_px(moved: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -227,7 +418,7 @@ def expect(squared_px2: np.ndarray) -> Weights:
 
 def _start(setup: CalibrationSetup, measured: MeasuredFrames, target: np.ndarray, progress: Step) -> tuple[np.ndarray, int]:
     """Values (P,) and sign of the turns at the start: the best fit among both signs and all quarter turns of the image."""
-    value = values_of(setup.sensor, setup.experiment, setup.parameters)
+    value = setup.quantities
     by_turn = np.argsort([-np.abs(label.pose[3:] - label.move[3:]).max() for label in measured.labels])[:START_FRAMES]
     by_move = np.argsort([-np.abs(label.move[:3]).max() for label in measured.labels])[:START_FRAMES]
     telling = np.union1d(by_turn, by_move)
@@ -240,21 +431,6 @@ def _start(setup: CalibrationSetup, measured: MeasuredFrames, target: np.ndarray
     if not np.isfinite(errors).any():
         raise FrameError("none of the first contacts can be simulated; are `experiment` and `sensor` those of the frames?")
     return tries[int(np.nanargmin(errors))]
-
-
-def simulate(setup: CalibrationSetup, measured: MeasuredFrames, values: list, sign: int, progress: Step = unheard) -> np.ndarray:
-    """(V, M, 2, N, 2) px for V vectors of values."""
-    jobs = [(each, sign, row) for each in values for row in range(len(measured))]
-    return setup.displacements(jobs, measured.labels, progress).reshape(len(values), len(measured), 2, -1, 2)
-
-
-def _slopes(
-    setup: CalibrationSetup, measured: MeasuredFrames, value: np.ndarray, sign: int, moved: np.ndarray, progress: Step
-) -> np.ndarray:
-    """Derivatives (P, M, 2, N, 2) of the displacements by each fitted quantity, px; 0 for a failed contact."""
-    steps = np.diag([p.step for p in setup.parameters])
-    there = simulate(setup, measured, [value + step for step in steps], sign, progress)
-    return np.nan_to_num((there - moved) / np.diag(steps)[:, None, None, None, None])
 
 
 def mean_squared(moved: np.ndarray, target: np.ndarray) -> np.ndarray:

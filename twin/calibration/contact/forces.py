@@ -14,7 +14,7 @@ of Student's distribution.
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -26,13 +26,10 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
-from scenes.experiment import ExperimentSpec
-from scenes.object import ObjectSpec
 from scenes.rig import ForceSensorSpec
 from scenes.sensor import SensorSpec
-from twin.calibration.contact.fit import shorten_step
+from twin.calibration.contact.fit import DETERMINED, PARAMETERS, SIZE, FittedContacts, FittedParameter, shorten_step
 from twin.calibration.contact.newtons import COVERED, compare_forces
-from twin.calibration.contact.parameters import DETERMINED, PARAMETERS, SIZE, FittedParameter, values_of, with_quantities
 from twin.calibration.contact.report import add_parameters, describe_parameters
 from twin.errors import ContactError, FrameError, OptionError
 from twin.frames.tables import called_here, numbers, read_columns, unlikely_units
@@ -120,15 +117,10 @@ class ForceComparison(ReadableResult):
 
 
 @dataclass(frozen=True)
-class ForceSetup:
-    """What all contacts of a table have in common (see ``CalibrationSetup``). The sensor is that of the start of a fit."""
+class ForceSetup(FittedContacts):
+    """The contacts of a table of forces."""
 
-    sensor: SensorSpec
-    experiment: ExperimentSpec
-    obj: ObjectSpec
-    across: int
-    workers: int = 1
-    parameters: tuple[FittedParameter, ...] = FORCE_PARAMETERS
+    parameters: tuple[FittedParameter, ...] = field(default=FORCE_PARAMETERS, kw_only=True)
 
     @property
     def reads(self) -> ForceSensorSpec:
@@ -138,7 +130,7 @@ class ForceSetup:
     @property
     def start(self) -> np.ndarray:
         """Values (P + 4,) of the parameters and of ``CELL`` at the start."""
-        return np.array([*values_of(self.sensor, self.experiment, self.parameters), *self.reads.offset_n, self.reads.turn_deg])
+        return np.array([*self.quantities, *self.reads.offset_n, self.reads.turn_deg])
 
     def with_rig(self, **changes: Any) -> "ForceSetup":
         """The setup with other values of the rig."""
@@ -148,7 +140,7 @@ class ForceSetup:
     def sensor_of(self, values: np.ndarray) -> SensorSpec:
         """The sensor with other values (P + 4,)."""
         cell = {"offset_n": tuple(values[-4:-1].round(4).tolist()), "turn_deg": round(float(values[-1]), 2)}
-        sensor = with_quantities(self.sensor, self.experiment, values[:-4], rig_of(self.sensor).turn_sign, self.parameters)
+        sensor = self.sensor_with(values[:-4], rig_of(self.sensor).turn_sign)
         return replace(self, sensor=sensor).with_rig(force_sensor=self.reads.alter(**cell)).sensor
 
     def forces(self, values: Sequence[np.ndarray], labels: Sequence[ArmLabel], step: Step = unheard) -> np.ndarray:

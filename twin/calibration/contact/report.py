@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from twin.calibration.contact.fit import INDEPENDENT, ContactFit
-from twin.calibration.contact.parameters import DETERMINED, Z90, FittedParameter
-from twin.calibration.contact.simulate import CalibrationSetup
+from twin.calibration.contact.fit import DETERMINED, INDEPENDENT, Z90, CalibrationSetup, ContactFit, FittedParameter
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.frames import distinct_stems
 from twin.report.charts import new_figure, write_chart

@@ -6,6 +6,7 @@ from itertools import product
 import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
+from scipy.stats import binned_statistic
 
 from scenes.sensor import HousingSpec, LedRingSpec, ResponseSpec, SensorSpec
 from twin.calibration.light.still import Still, fit_bounded, level_misfit, sample_field, subpixel_offsets
@@ -84,10 +85,8 @@ def _glow_by_degree(still: Still, housing: HousingSpec, pupil_mm: float, respons
     beyond_mm = np.linalg.norm(out_mm, axis=-1) - housing.aperture_radius_mm
     near = (beyond_mm > 0) & (beyond_mm < GLOW_SHARE * housing.aperture_radius_mm)
     azimuth = np.degrees(np.arctan2(out_mm[near][:, 1], out_mm[near][:, 0])) % 360
-    degree = np.minimum(azimuth.astype(int), 359)  # a very small negative angle modulo 360 is rounded to 360
-    sums = np.bincount(degree, to_light(still.gray[near], response), minlength=360)
-    glow = sums / np.maximum(np.bincount(degree, minlength=360), 1)
-    return gaussian_filter1d(glow, GLOW_SMOOTH_DEG, mode="wrap")
+    glow = binned_statistic(azimuth, to_light(still.gray[near], response), bins=360, range=(0, 360)).statistic
+    return gaussian_filter1d(np.nan_to_num(glow), GLOW_SMOOTH_DEG, mode="wrap")
 
 
 def fit_reflections(spec: SensorSpec, still: Still) -> SensorSpec:

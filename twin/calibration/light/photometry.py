@@ -10,7 +10,7 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from twin.camera.capture import blurred
-from twin.evaluation.pictures.aligned import SATURATED, Aligned, levels_slope, require_cameras_own, to_levels, to_light, with_changes
+from twin.evaluation.pictures.aligned import SATURATED, Aligned, levels_slope, to_levels, to_light, with_changes
 from twin.evaluation.pictures.statistics import clear_of_pins
 from twin.geometry.pins import usual_spacing
 from twin.optics.light_model import Knobs, LightModel
@@ -94,14 +94,7 @@ def fit_photometry(spec: SensorSpec, frames: list[Aligned], progress: Step) -> S
     frames : list of Aligned
     progress : callable
         ``progress(done, total)``.
-
-    Raises
-    ------
-    FrameError
-        A frame does not have the camera's size and channels.
     """
-    for frame in frames:
-        require_cameras_own(frame.image, frame.name, spec.camera)
     rng, renderer, width = np.random.default_rng(0), Renderer(spec), spec.camera.width_px
     samples = [sample_frame(frame, renderer.static, spec, rng) for frame in frames]
     models = [

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -201,14 +202,11 @@ def fit_focus(spec: SensorSpec, seen: Sharpness) -> SensorSpec:
     """
     before = defocus_px(spec.camera.fx_px, spec.camera.aperture_mm, spec.camera.focus_mm, seen.distance_mm)
     wanted = seen.real_px**2 - seen.rendered_px**2 + (DISC_WIDTH * before) ** 2
-    best = (np.inf, 0.0, spec.camera.focus_mm)
-    for focus in np.linspace(FOCUS_RANGE[0] * seen.distance_mm.min(), FOCUS_RANGE[1] * seen.distance_mm.max(), TRIED):
-        for aperture in np.linspace(0, MOST_APERTURE_MM, TRIED):
-            grown = (DISC_WIDTH * defocus_px(spec.camera.fx_px, aperture, focus, seen.distance_mm)) ** 2
-            miss = float(np.var(wanted - grown))
-            if miss < best[0]:
-                best = miss, aperture, focus
-    return with_changes(spec, camera={"aperture_mm": round(best[1], 3), "focus_mm": round(float(best[2]), 2)})
+    nearest, farthest = FOCUS_RANGE[0] * seen.distance_mm.min(), FOCUS_RANGE[1] * seen.distance_mm.max()
+    tried = list(product(np.linspace(nearest, farthest, TRIED), np.linspace(0, MOST_APERTURE_MM, TRIED)))
+    grown = [(DISC_WIDTH * defocus_px(spec.camera.fx_px, aperture, focus, seen.distance_mm)) ** 2 for focus, aperture in tried]
+    focus, aperture = tried[int(np.argmin(np.var(wanted - grown, axis=1)))]
+    return with_changes(spec, camera={"aperture_mm": round(float(aperture), 3), "focus_mm": round(float(focus), 2)})
 
 
 def defocus_px(focal_px: float, aperture_mm: float, focus_mm: float, distance_mm: np.ndarray) -> np.ndarray:

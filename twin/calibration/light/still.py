@@ -5,10 +5,11 @@ The still picture is the median of the frames. It shows what does not change wit
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import approx_fprime, least_squares
 
 from scenes.sensor import ResponseSpec, SensorSpec
 from twin.camera.projection import pixel_rays
@@ -94,10 +95,7 @@ def fit_bounded(residual: Residual, start: np.ndarray, low: np.ndarray, high: np
     def at(share: np.ndarray) -> np.ndarray:
         return residual(low + share * span)
 
-    def slopes(share: np.ndarray) -> np.ndarray:
-        here = at(share)
-        return np.column_stack([(at(share + SLOPE_STEP * unit) - here) / SLOPE_STEP for unit in np.eye(len(share))])
-
+    slopes = partial(approx_fprime, f=at, epsilon=SLOPE_STEP)
     first = np.clip((start - low) / span, BOUND_MARGIN, 1 - BOUND_MARGIN)
     fit = least_squares(at, first, slopes, (0, 1), loss="soft_l1", f_scale=ROBUST_LEVELS, max_nfev=most_steps, xtol=1e-4, ftol=1e-5)
     return low + fit.x * span

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from twin.evaluation.degradation.condition import DegradedCase
-from twin.evaluation.degradation.measures import MEASURES, POSE_MEASURES, Measure
-from twin.evaluation.degradation.sweep import SweepSettings, run_sweep
+from twin.evaluation.degradation.sweep import MEASURES, POSE_MEASURES, Measure, SweepSettings, run_sweep
 from twin.pins.labelling.reference import nominal_reference
 
 DRAWS = 400

@@ -9,8 +9,7 @@ from matplotlib.figure import Figure
 
 from twin.evaluation.degradation.condition import DegradedCase
 from twin.evaluation.degradation.envelope import NEAR, SHORT, Curve, Envelope, Share, SweepEvaluation, shares_of
-from twin.evaluation.degradation.measures import MEASURES, POSE_MEASURES
-from twin.evaluation.degradation.sweep import SweepSettings, cells_of
+from twin.evaluation.degradation.sweep import MEASURES, POSE_MEASURES, SweepSettings, cells_of
 from twin.pins import DetectorSpec
 from twin.report.charts import faint, muted_colour, sized_figure, write_chart
 from twin.report.page import Page, PagePicture, bad, good, link_to, sentence, strong

@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from scenes import load_object
-from scenes.sensor import SensorSpec
+from scenes.sensor import ResponseSpec, SensorSpec
 from twin.camera.capture import expose
 from twin.camera.truth import CapTruth, cap_truth
 from twin.errors import ContactError, TwinError
@@ -42,16 +42,6 @@ CONTACTS = (
     ObjectContact("cylinder", "cylinder", ContactPose(3.0, offset_mm=(3.0, 2.0))),
 )
 """Contacts of a sweep."""
-NEUTRAL: dict[str, dict[str, float | int | str | tuple[float, ...] | None]] = {
-    "response": {
-        "exposure": 1.0, "white_balance": (1.0, 1.0, 1.0), "blur_sigma_px": 0.0, "brightness_drift": 0.0, "read_noise": 0.0,
-        "shot_noise": 0.0, "sharpening": 0.0, "chroma_sigma_px": 0.0, "chroma_median_px": 0, "chroma_columns": 1, "stream": "rgb",
-        "jpeg_quality": 0, "residual": None,
-    },
-    "camera": {"vignetting": 0.0, "red_scale": 1.0, "blue_scale": 1.0, "red_shift_px": (0.0, 0.0), "blue_shift_px": (0.0, 0.0)},
-    "gel": {"haze": 0.0},
-}  # fmt: skip
-"""Values of a specification whose camera adds no blur, colour or noise. They are used for real frames, which a camera has already taken."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +123,7 @@ class RealSource:
 
     def render(self, case: DegradedCase, severity: float) -> list[DegradedFrame]:
         """The frames degraded by a case, which must be `image_level`."""
-        neutral = self.spec.alter(**NEUTRAL)
+        neutral = _neutral(self.spec)
         spec = case.on_spec(neutral, severity)
         in_light = severity > 0 and self.form == Form.RAW and case.in_light
         view, shots = PictureView.of(neutral, self.caps_px[0]), []
@@ -217,6 +207,14 @@ def _degrade(
     return DegradedFrame(name, Frame(image, form, name), caps_px, visible & inside & ~gone)
 
 
+def _neutral(spec: SensorSpec) -> SensorSpec:
+    """A specification whose camera adds no blur, colour or noise. It is used for real frames, which a camera has already taken."""
+    curve = {name: getattr(spec.response, name) for name in ("gamma", "black_level", "sharpening_sigma_px", "noise_sigma_px")}
+    response = ResponseSpec(**curve, blur_sigma_px=0.0, read_noise=0.0, shot_noise=0.0)
+    fringes = {"red_scale": 1.0, "blue_scale": 1.0, "red_shift_px": (0.0, 0.0), "blue_shift_px": (0.0, 0.0)}
+    return spec.alter(response=response, camera={"vignetting": 0.0} | fringes, gel={"haze": 0.0})
+
+
 def _with_light_of(base: SensorSpec, spec: SensorSpec) -> SensorSpec:
     """``spec`` with the values of ``base`` that do not affect the pins' places. Under most conditions the result equals ``base``."""
     gel = {name: getattr(base.gel, name) for name in ("haze", "haze_sigma_px", "absorption_per_mm")}
@@ -236,17 +234,11 @@ def _films(
     preview, films = Preview(spec), []
     for draw, contact in enumerate(contacts):
         try:
-            state, truth = _press(geometry, mechanics, contact)
+            state = pins_under(mechanics, contact)
         except ContactError:
             continue
+        truth = cap_truth(geometry, rest_pins(geometry.geometry), state, Form.RAW)
         light = preview.render(state)
         light.flags.writeable = False  # the array is shared by all conditions
         films.append((draw, contact.name, light, truth, contact.pose.indent_mm > 0))
     return tuple(films)
-
-
-@lru_cache(maxsize=32)
-def _press(spec: SensorSpec, mechanics: SensorSpec, contact: ObjectContact) -> tuple[PinRest, CapTruth]:
-    """Pins in a contact of the sensor ``mechanics``, and their places in the picture of ``spec``'s camera."""
-    state = pins_under(mechanics, contact)
-    return state, cap_truth(spec, rest_pins(spec.geometry), state, Form.RAW)

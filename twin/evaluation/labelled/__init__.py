@@ -1,4 +1,3 @@
 """Comparison of the twin's pins with those of labelled real frames."""
 
-from twin.evaluation.labelled.compare import Comparison, compare, table_of
-from twin.evaluation.labelled.model import ContactModel, MeasuredFrames, measure_frames
+from twin.evaluation.labelled.model import Comparison, ContactModel, MeasuredFrames, compare, measure_frames, table_of

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from twin.evaluation.labelled.compare import MEASURES, Comparison, table_of
+from twin.evaluation.labelled.model import MEASURES, Comparison, table_of
 from twin.report.charts import new_figure, write_chart
 from twin.report.page import Page, PagePicture
 from twin.report.plots import draw_displacement, enlargement
@@ -53,7 +53,7 @@ def write_validation(out: Path, found: Comparison, description: str, summary: di
         The files, the page first.
     """
     table = write_table(out / "frames.csv", _frame_rows(found))
-    figures = write_json(out / "validation.json", summary | {"made_by": made_by("twin.evaluation.labelled.compare")})
+    figures = write_json(out / "validation.json", summary | {"made_by": made_by("twin.evaluation.labelled.model")})
     errors = write_chart(out / "errors.png", lambda: _draw_errors(found))
     frames = write_chart(out / "frames.png", lambda: _draw_worst(found))
     page = Page(

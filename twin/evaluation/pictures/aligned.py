@@ -5,7 +5,7 @@ their fitted skin.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -60,18 +60,10 @@ class RealFrame:
         return self.frame.image if rendered.ndim == self.frame.image.ndim else self.gray
 
 
-@dataclass(frozen=True)
-class RealFrames:
-    """The usable frames of a folder; ``refused``: ``image_name`` and ``reason`` of the others."""
-
-    frames: list[RealFrame]
-    refused: list[BadFrame] = field(default_factory=list)
-
-
 def read_real(
     path: Path, spec: SensorSpec, disc: Disc, *, limit: int | None = None, fitted: int = 0, lost: float = 0.0, progress: Step = unheard
-) -> RealFrames:
-    """Read raw frames. If there are more than ``limit``, a selection that is evenly distributed over the recording is read.
+) -> tuple[list[RealFrame], list[BadFrame]]:
+    """Usable raw frames of a folder, and the refused ones. Of more than ``limit``, an even selection over the recording is read.
 
     Parameters
     ----------
@@ -111,7 +103,7 @@ def read_real(
     if not frames:
         first, given = refused[0], format_count(len(chosen), "frames")
         raise FrameError(f"{path}: none of {given} are valid; the first, {first['image_name']}: {first['reason']}")
-    return RealFrames(frames, refused)
+    return frames, refused
 
 
 def check_frame(frame: Frame, pipeline: Pipeline, disc: Disc, lost: float = 0.0) -> Observation:
@@ -171,11 +163,11 @@ def read_frames(
         No frame can be used, or a frame does not fit the camera: its size differs, or one of both is colour and the other mono. The
         message names the first such frame and the reason.
     """
-    real = read_real(folder, spec, lens_disc(spec.view, spec.housing), limit=limit, lost=FEW_LOST, progress=progress)
-    read = [(found.frame.name, in_channels(found.frame.image, spec.camera), found.pins_px) for found in real.frames]
+    real, refused = read_real(folder, spec, lens_disc(spec.view, spec.housing), limit=limit, lost=FEW_LOST, progress=progress)
+    read = [(found.frame.name, in_channels(found.frame.image, spec.camera), found.pins_px) for found in real]
     for name, image, _ in read:
         require_cameras_own(image, name, spec.camera)
-    return read, real.refused
+    return read, refused
 
 
 def in_channels(image: np.ndarray, camera: CameraSpec) -> np.ndarray:
@@ -200,14 +192,12 @@ def require_cameras_own(image: np.ndarray, name: str, camera: CameraSpec) -> Non
 def to_light(levels: np.ndarray, response: ResponseSpec) -> np.ndarray:
     """Light in the renderer's unit from gray levels, by the inverse of response curve, white balance and exposure."""
     share = np.clip((np.asarray(levels, float) - response.black_level) / (255 - response.black_level), 0, 1)
-    gain = _gain(levels, response)
-    return share**response.gamma / gain
+    return share**response.gamma / _gain(levels, response)
 
 
 def to_levels(light: np.ndarray, response: ResponseSpec) -> np.ndarray:
     """Gray levels (float, not rounded) from light: the inverse of ``to_light``."""
-    gain = _gain(light, response)
-    return response.black_level + (255 - response.black_level) * np.clip(gain * light, 0, 1) ** (1 / response.gamma)
+    return response.black_level + (255 - response.black_level) * np.clip(_gain(light, response) * light, 0, 1) ** (1 / response.gamma)
 
 
 def levels_slope(light: np.ndarray, response: ResponseSpec) -> np.ndarray:

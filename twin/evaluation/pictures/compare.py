@@ -8,39 +8,53 @@ then applied to all frames.
 The pins of a tap are a smooth function of the indentation and the plate's normal in the sensor frame. While the rig is fitted, this
 function is approximated by a cubic polynomial fitted to simulated taps. In a second round the polynomial's errors at the contacts of the
 first round are corrected.
+
+Pictures are compared over the lens disc. The figures are PSNR, SSIM (Wang et al. 2004, computed by scikit-image) and FLIP (Andersson et
+al. 2020). FLIP is the difference, from 0 to 1, that is visible when both pictures alternate on a normal screen (67 px per degree). Outside
+the disc both pictures are made equal, so that these pixels do not affect SSIM and FLIP near the disc's edge.
+
+A part of what renders miss on the caps is a picture fixed to each cap (``fixed_share``), which a better relief could hold.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 
+import cv2
+import flip_evaluator
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
+from skimage.metrics import structural_similarity
 
 from scenes import load_experiment, load_object
 from scenes.experiment import ExperimentSpec
 from scenes.rig import RigSpec
-from scenes.sensor import Polarity, SensorSpec
+from scenes.sensor import PinsSpec, Polarity, SensorSpec, ViewSpec
 from twin.camera.capture import expose
 from twin.camera.projection import Disc, project
 from twin.errors import FrameError
-from twin.evaluation.labelled.compare import pin_errors
+from twin.evaluation.labelled.model import pin_errors
 from twin.evaluation.pictures.aligned import RealFrame
-from twin.evaluation.pictures.images import ImageFigures, cap_patches, compare_images, fixed_share
 from twin.evaluation.pictures.statistics import FrameStatistics, Statistics
 from twin.frames.forms import gray_levels
-from twin.geometry.mesh import SensorMesh
 from twin.mechanics.skin_fit import FittedPins, SkinFit
 from twin.mechanics.solver import SkinSolver
+from twin.optics.relief import SKIN_FROM, cap_planes
 from twin.optics.render import Renderer
 from twin.pins.pipeline import Pipeline
 from twin.progress import Bar, Step, report_each
 from twin.rig.contact import RigContact
 from twin.rig.kinematics import object_pose, rig_of
 from twin.rig.labels import ArmLabel
-from twin.types import ContactState, Form, Quality
+from twin.types import ContactState, FloatArray, Form, ImageArray, PinState, Quality
 
+# Range of 8-bit gray levels.
+LEVELS = 255.0
+# Amplification of the difference picture.
+CHANGE_GAIN = 2
+# Places along the diameter of a cap and its edge at which a difference is read.
+PLACES = 19
 # Experiment of recordings whose labels are depth and two tilts.
 EXPERIMENT = "surface-3d"
 # Number of simulated taps: twice the 20 terms of the polynomial.
@@ -59,6 +73,18 @@ TURNS_DEG = (0.0, 90.0, 180.0, 270.0)
 FEWEST = 2
 # Number of fitted parameters.
 PARAMETERS = 7
+
+
+@dataclass(frozen=True)
+class ImageFigures:
+    """Similarity of one pair: PSNR in dB (inf: identical), SSIM (1: identical), FLIP (0: identical); ``psnr_whole_db``: of whole frames."""
+
+    psnr_db: float
+    psnr_gray_db: float
+    ssim: float
+    ssim_gray: float
+    flip: float
+    psnr_whole_db: float
 
 
 @dataclass(frozen=True)
@@ -97,24 +123,19 @@ class PoseAligned:
         The fitted rig.
     fitted : (M,) bool
         The frames that the rig was fitted to.
-    contacts : (M, 3) float
-        Indentation in mm, n_x and n_y of each frame's contact.
     pairs : list of Pair
     """
 
     rig: RigSpec
     fitted: np.ndarray
-    contacts: np.ndarray
     pairs: list[Pair]
 
 
 def pin_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quality: Quality, progress: Step) -> list[Pair]:
     """Fit the skin to each frame's pins, render and capture it. This tests camera and light, but not the mechanics."""
-    fit, shoot, pairs = SkinFit(spec), _Shooter(spec, disc, quality), []
-    for number, real in enumerate(report_each(frames, progress)):
-        pins = fit(real.pins_px)
-        pairs.append(shoot(real, pins, float(np.nanmedian(pins.remainder_px)), seed=number))
-    return pairs
+    fitted = map(SkinFit(spec), (real.pins_px for real in report_each(frames, progress)))
+    states = ((real, pins, float(np.nanmedian(pins.remainder_px))) for real, pins in zip(frames, fitted, strict=True))
+    return _pairs(Renderer(spec, quality=quality), disc, states)
 
 
 def pose_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quality: Quality, bar: Bar) -> PoseAligned:
@@ -136,13 +157,16 @@ def pose_aligned(spec: SensorSpec, frames: list[RealFrame], disc: Disc, *, quali
     with bar("fit the arm's rig") as progress:
         seen_px = np.stack([real.pins_px for real in frames])[fitted]
         rig = fit_rig(bank, start, experiment, learnt, seen_px, apex_mm, simulate=lambda tried: tapped_px(taps(tried), learnt, progress))
-    contact, shoot, pairs = taps(rig), _Shooter(spec, disc, quality, mesh=solver.mesh), []
-    with bar("press and render from the labels") as progress:
-        for number, (real, label) in enumerate(report_each(list(zip(frames, labels, strict=True)), progress)):
+    contact = taps(rig)
+
+    def press(progress: Step) -> Iterator[tuple[RealFrame, ContactState, float]]:
+        """The frames, their labels' contacts, and the pins' errors."""
+        for real, label in report_each(list(zip(frames, labels, strict=True)), progress):
             state = contact.end(label)
-            error_px = pin_errors(project(spec.view, state.caps_mm), real.pins_px)
-            pairs.append(shoot(real, state, float(error_px), seed=number))
-    return PoseAligned(rig, fitted, contacts_of(rig, experiment, labels, apex_mm), pairs)
+            yield real, state, float(pin_errors(project(spec.view, state.caps_mm), real.pins_px))
+
+    with bar("press and render from the labels") as progress:
+        return PoseAligned(rig, fitted, _pairs(Renderer(spec, quality=quality, mesh=solver.mesh), disc, press(progress)))
 
 
 def statistics(pairs: list[Pair], disc: Disc, polarity: Polarity, *, progress: Step) -> Statistics:
@@ -164,18 +188,14 @@ def fixed_residual(spec: SensorSpec, pairs: list[Pair]) -> dict[str, float] | No
     return {"levels": float(np.sqrt(np.mean(patches**2))), "share": share} if np.isfinite(share) else None
 
 
-class _Shooter:
-    """Renders states and compares the renders with real frames."""
-
-    def __init__(self, spec: SensorSpec, disc: Disc, quality: Quality, mesh: SensorMesh | None = None):
-        self._spec, self._disc = spec, disc
-        self._renderer = Renderer(spec, quality=quality, mesh=mesh)
-        self._pipeline = Pipeline(spec, Form.RAW)
-
-    def __call__(self, real: RealFrame, state: FittedPins | ContactState, remainder_px: float, *, seed: int) -> Pair:
-        image = expose(self._renderer.render(state, seed=seed), self._spec.capture, np.random.default_rng(seed))
-        seen = self._pipeline(replace(real.frame, image=image))
-        return Pair(real, state, image, compare_images(real.like(image), image, self._disc.inside), remainder_px, seen.complete)
+def _pairs(renderer: Renderer, disc: Disc, states: Iterable[tuple[RealFrame, FittedPins | ContactState, float]]) -> list[Pair]:
+    """Renders of states, compared with their real frames. A state's remainder in px follows it."""
+    spec, pipeline, pairs = renderer.spec, Pipeline(renderer.spec, Form.RAW), []
+    for seed, (real, state, remainder_px) in enumerate(states):
+        image = expose(renderer.render(state, seed=seed), spec.capture, np.random.default_rng(seed))
+        seen = pipeline(replace(real.frame, image=image))
+        pairs.append(Pair(real, state, image, compare_images(real.like(image), image, disc.inside), remainder_px, seen.complete))
+    return pairs
 
 
 def label_columns(experiment: ExperimentSpec) -> tuple[str, ...]:
@@ -331,3 +351,81 @@ def halves(count: int, seed: int = 0) -> np.ndarray:
     fitting = np.zeros(count, bool)
     fitting[np.random.default_rng(seed).permutation(count)[: count // 2]] = True
     return fitting
+
+
+def compare_images(real: np.ndarray, rendered: np.ndarray, inside: np.ndarray) -> ImageFigures:
+    """Figures of a pair of 8-bit frames, (H, W) or (H, W, 3), over the pixels ``inside`` (H, W) bool.
+
+    Raises
+    ------
+    FrameError
+        The frames differ in shape or are not 8-bit.
+    """
+    if real.shape != rendered.shape or real.dtype != np.uint8 or rendered.dtype != np.uint8:
+        raise FrameError(
+            f"can't compare {rendered.dtype} {rendered.shape} with {real.dtype} {real.shape}; give two 8-bit frames of one sensor"
+        )
+    masked = np.where(inside if real.ndim == 2 else inside[..., None], rendered, real)
+    gray, masked_gray = gray_levels(real), gray_levels(masked)
+    return ImageFigures(
+        psnr_db=_psnr_db(real[inside], masked[inside]),
+        psnr_gray_db=_psnr_db(gray[inside], masked_gray[inside]),
+        ssim=_ssim(real, masked, inside),
+        ssim_gray=_ssim(gray, masked_gray, inside),
+        flip=float(flip_map(real, masked)[inside].mean()),
+        psnr_whole_db=_psnr_db(real, rendered),
+    )
+
+
+def flip_map(real: np.ndarray, rendered: np.ndarray) -> np.ndarray:
+    """(H, W) FLIP of two 8-bit frames."""
+    pair = (np.repeat(a[..., None], 3, axis=2) if a.ndim == 2 else a for a in (real, rendered))
+    reference, test = (np.ascontiguousarray(a, np.float32) / np.float32(LEVELS) for a in pair)
+    return flip_evaluator.evaluate(reference, test, "LDR", applyMagma=False, computeMeanError=False)[0][..., 0]
+
+
+def difference_picture(real: np.ndarray, rendered: np.ndarray) -> np.ndarray:
+    """Difference picture (uint8), amplified twice: above middle gray the render is brighter than the real frame, below it is darker."""
+    return np.clip(127.5 + CHANGE_GAIN * (rendered.astype(float) - real), 0, 255).astype(np.uint8)
+
+
+def _psnr_db(real: np.ndarray, rendered: np.ndarray) -> float:
+    mean_square = np.mean((real.astype(float) - rendered) ** 2)
+    return float("inf") if mean_square == 0 else float(10 * np.log10(LEVELS**2 / mean_square))
+
+
+def _ssim(real: np.ndarray, rendered: np.ndarray, inside: np.ndarray) -> float:
+    axis = 2 if real.ndim == 3 else None
+    _, local = structural_similarity(real, rendered, data_range=LEVELS, channel_axis=axis, full=True)
+    return float(local[inside].mean())
+
+
+def cap_patches(view: ViewSpec, pins: PinsSpec, state: PinState, real: ImageArray, rendered: ImageArray) -> FloatArray:
+    """Real less rendered gray levels (N, k) at the same places of all caps' planes, up to ``SKIN_FROM`` cap radii from their middles.
+
+    Parameters
+    ----------
+    real, rendered : (H, W) or (H, W, C) uint8
+        Of the same state. Of C channels the levels at the k / C places follow one another.
+    """
+    side = np.linspace(-SKIN_FROM, SKIN_FROM, PLACES)
+    places = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    places = places[np.linalg.norm(places, axis=1) <= SKIN_FROM]
+    middle, plane = cap_planes(view, pins, state)
+    at = (middle[:, None] + np.einsum("nij,pj->npi", plane, places)).astype(np.float32)
+    difference = real.astype(np.float32) - rendered.astype(np.float32)
+    read = cv2.remap(difference, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(read, np.float32).reshape(len(middle), -1)
+
+
+def fixed_share(patches: FloatArray) -> float:
+    """Share of the power of patches (M, N, k) that is the same for a cap in all M frames; without bias, so that it may be below 0.
+
+    The mean over pairs of different frames of the product of their patches, relative to the mean square. A mean over the frames alone
+    would count 1 / M of what changes from frame to frame. NaN if there is one frame, or nothing is missed.
+    """
+    count, values = len(patches), np.asarray(patches, float)
+    power = float(np.sum(values**2))
+    if count < 2 or power == 0:
+        return np.nan
+    return float((np.sum(values.sum(axis=0) ** 2) - power) / (count - 1) / power)

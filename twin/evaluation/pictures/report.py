@@ -7,8 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from scenes.sensor import SensorSpec
-from twin.evaluation.pictures.compare import Pair, PoseAligned
-from twin.evaluation.pictures.images import difference_picture
+from twin.evaluation.pictures.compare import Pair, PoseAligned, difference_picture
 from twin.evaluation.pictures.statistics import RADIAL_MEASURES, TARGET, TARGET_MEASURES, RadialRow, Statistics
 from twin.frames import distinct_stems
 from twin.frames.images import write_image

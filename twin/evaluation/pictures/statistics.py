@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.stats import binned_statistic
+from skimage.measure import label, regionprops
 
 from scenes.sensor import Polarity
 from twin.camera.projection import Disc
@@ -199,12 +201,9 @@ def radial_spectrum(gray: np.ndarray, center_px: np.ndarray, radius_px: float) -
     power = np.abs(np.fft.fft2(patch)) ** 2 / (window**2).sum()
     f = np.hypot(*np.meshgrid(np.fft.fftfreq(len(patch)), np.fft.fftfreq(len(patch))))
     edges = np.geomspace(LOWEST_CYCLES / (2 * half), 0.5, SPECTRUM_BINS + 1)
-    ring = np.digitize(f.ravel(), edges) - 1
-    inside = (ring >= 0) & (ring < SPECTRUM_BINS)
-    count = np.bincount(ring[inside], minlength=SPECTRUM_BINS)
-    total = np.bincount(ring[inside], power.ravel()[inside], SPECTRUM_BINS)
-    used = count > 0
-    return np.sqrt(edges[:-1] * edges[1:])[used], total[used] / count[used]
+    mean = binned_statistic(f.ravel(), power.ravel(), bins=edges).statistic
+    used = np.isfinite(mean)
+    return np.sqrt(edges[:-1] * edges[1:])[used], mean[used]
 
 
 def log_distance_db(real: np.ndarray, rendered: np.ndarray) -> float:
@@ -225,14 +224,9 @@ def find_spots(gray: np.ndarray, disc: Disc, pins_px: np.ndarray, spacing_px: fl
     looked = (disc.inside & clear_of_pins(gray.shape, pins_px, PIN_SHARE * spacing_px)).astype(np.uint8)
     looked &= cv2.circle(np.zeros_like(looked), np.rint(disc.center_px).astype(int).tolist(), int(disc.radius_px - RIM_PX), 1, -1)
     rise = gray.astype(np.float32) - cv2.medianBlur(np.ascontiguousarray(gray), GROUND_PX)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(((rise > RISE) & (looked > 0)).astype(np.uint8), connectivity=8)
-    places, peaks = [], []
-    for k in range(1, count):
-        if stats[k, cv2.CC_STAT_AREA] >= MIN_AREA_PX2:
-            rows, columns = np.nonzero(labels == k)
-            places.append(np.average(np.column_stack([columns, rows]), axis=0, weights=rise[rows, columns]))
-            peaks.append(float(gray[rows, columns].max()))
-    return Spots(np.array(places).reshape(-1, 2), np.array(peaks))
+    spots = [spot for spot in regionprops(label((rise > RISE) & (looked > 0)), rise) if spot.area >= MIN_AREA_PX2]
+    peaks = [float(gray[spot.slice][spot.image].max()) for spot in spots]
+    return Spots(np.array([spot.centroid_weighted[::-1] for spot in spots]).reshape(-1, 2), np.array(peaks))
 
 
 def steady_spots(frames: list[Spots], share: float = STEADY_SHARE) -> Spots:

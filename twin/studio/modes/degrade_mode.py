@@ -9,9 +9,8 @@ from twin.errors import TwinError
 from twin.estimate import Estimate
 from twin.evaluation.degradation.condition import DegradedCase
 from twin.evaluation.degradation.conditions import CONDITIONS, condition
-from twin.evaluation.degradation.measures import MEASURES, measure_frame
 from twin.evaluation.degradation.shots import DegradedFrame, degraded_state
-from twin.evaluation.degradation.sweep import SEVERITIES
+from twin.evaluation.degradation.sweep import MEASURES, SEVERITIES, measure_frame
 from twin.optics.preview import Shading
 from twin.pins import make_detector, nominal_reference, shipped_detector
 from twin.pins.pipeline import Pipeline

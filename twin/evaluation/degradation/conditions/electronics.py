@@ -65,14 +65,7 @@ def offset_px(value: float, view: PictureView) -> tuple[int, int]:
 def wrong_crop(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
     """The camera's window is at another place: the picture is displaced, and black outside of the original window."""
     dx, dy = offset_px(value, view)
-    if not (dx or dy):
-        return image
-    height, width = image.shape[:2]
-    out = np.zeros_like(image)
-    out[max(dy, 0) : height + min(dy, 0), max(dx, 0) : width + min(dx, 0)] = image[
-        max(-dy, 0) : height + min(-dy, 0), max(-dx, 0) : width + min(-dx, 0)
-    ]
-    return out
+    return cv2.warpAffine(image, np.array([[1.0, 0.0, dx], [0.0, 1.0, dy]]), image.shape[1::-1], flags=cv2.INTER_NEAREST)
 
 
 def displaced(px: np.ndarray, value: float, view: PictureView) -> np.ndarray:

@@ -68,27 +68,22 @@ def blurred_by(light: np.ndarray, kernel: np.ndarray) -> np.ndarray:
 
 
 def disc_kernel(diameter_px: float) -> np.ndarray:
-    """Coverage of pixels by a disc, with the sum 1: the circle of confusion."""
+    """Coverage of pixels by a disc, with the sum 1: the circle of confusion. The smallest disc covers the pixel in the middle alone."""
+    diameter_px = max(diameter_px, 2 / SUBPIXELS)
     half = int(np.ceil(diameter_px / 2 + 0.5))
     fine = (np.arange((2 * half + 1) * SUBPIXELS) + 0.5) / SUBPIXELS - half - 0.5
     inside = fine[:, None] ** 2 + fine**2 <= (diameter_px / 2) ** 2
     kernel = inside.reshape(2 * half + 1, SUBPIXELS, 2 * half + 1, SUBPIXELS).mean(axis=(1, 3))
-    if kernel.sum() == 0:  # the disc is smaller than a sub-pixel
-        kernel[half, half] = 1
     return (kernel / kernel.sum()).astype(np.float32)
 
 
 def line_kernel(length_px: float, degrees: float) -> np.ndarray:
     """Coverage of pixels by a straight line, with the sum 1."""
-    half = int(np.ceil(length_px / 2 + 1))
-    along = np.linspace(-0.5, 0.5, 20 * half + 1) * length_px
-    x, y = along * np.cos(np.radians(degrees)) + half, along * np.sin(np.radians(degrees)) + half
-    kernel = np.zeros((2 * half + 2, 2 * half + 2))
-    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
-    for dx in (0, 1):
-        for dy in (0, 1):
-            np.add.at(kernel, (top + dy, left + dx), np.abs(1 - dx - (x - left)) * np.abs(1 - dy - (y - top)))
-    return (kernel[: 2 * half + 1, : 2 * half + 1] / kernel.sum()).astype(np.float32)
+    half, angle = int(np.ceil(length_px / 2 + 1)), np.radians(degrees)
+    along, pixels = np.linspace(-0.5, 0.5, 20 * half + 1)[:, None] * length_px, np.arange(-half, half + 1)
+    columns, rows = (np.maximum(1 - np.abs(pixels - share * along), 0) for share in (np.cos(angle), np.sin(angle)))
+    kernel = rows.T @ columns
+    return (kernel / kernel.sum()).astype(np.float32)
 
 
 def defocus(light: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:

@@ -100,17 +100,12 @@ def torn_points(px: np.ndarray, value: float, view: PictureView) -> np.ndarray:
     return px + np.where(px[:, 1:] >= int(view.size_px[1]) // 2, [round(value), 0.0], 0.0)
 
 
-def mirrored(image: np.ndarray, value: float, view: PictureView, rng: np.random.Generator) -> np.ndarray:
-    """A picture with left and right exchanged."""
-    return np.ascontiguousarray(image[:, ::-1])
+def mirror(value: float, view: PictureView) -> np.ndarray:
+    """Map of pixels for a picture with left and right exchanged."""
+    return np.array([[-1.0, 0.0, view.size_px[0] - 1], [0.0, 1.0, 0.0]])
 
 
-def mirrored_points(px: np.ndarray, value: float, view: PictureView) -> np.ndarray:
-    """Positions in a mirrored picture."""
-    return np.column_stack([view.size_px[0] - 1 - px[:, 0], px[:, 1]])
-
-
-ROLL, SKEW, TURN = Warp(roll), Warp(skew), Warp(turn)
+ROLL, SKEW, TURN, MIRROR = Warp(roll), Warp(skew), Warp(turn), Warp(mirror)
 _camera, _on_frames, _picture = in_family("camera"), in_family("camera", image_level=True), in_family("picture", image_level=True)
 CONDITIONS = (
     _camera("camera-shifted", "camera shifted", "shift at the caps", "mm", 16.0, spec=shifted),
@@ -125,5 +120,5 @@ CONDITIONS = (
     _picture("picture-rolled", "rolled picture", "columns", "px", FARTHEST_PX, frame=rolled, moves=rolled_points),
     _picture("picture-torn", "torn picture", "columns of the lower half", "px", FARTHEST_PX, frame=torn, moves=torn_points),
     _picture("picture-turned", "turned picture", "angle", "deg", 180.0, frame=TURN.picture, moves=TURN.points),
-    _picture("picture-mirrored", "mirrored picture", "mirrored", "", 1.0, frame=mirrored, moves=mirrored_points),
+    _picture("picture-mirrored", "mirrored picture", "mirrored", "", 1.0, frame=MIRROR.picture, moves=MIRROR.points),
 )

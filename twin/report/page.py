@@ -21,7 +21,7 @@ from markupsafe import Markup, escape
 from twin.report.table import Column, Row, make_table
 from twin.report.themes import dark_of, stylesheet
 from twin.store import write_text
-from twin.store.made import program_version
+from twin.store.fingerprint import program_version
 
 Kind = Literal["chart", "frame", "photo"]
 # Least number of sections of a page that has a table of contents.

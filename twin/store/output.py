@@ -25,7 +25,7 @@ import platformdirs
 
 from twin.errors import StoreError
 from twin.store.atomic import LOCK, PART, lock_folder, unwritten, write_json
-from twin.store.made import PROGRAM
+from twin.store.fingerprint import PROGRAM
 
 WRITTEN = ".written.json"
 """Name of the list of files that this program wrote into a folder."""

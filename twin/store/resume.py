@@ -17,8 +17,7 @@ import numpy as np
 
 from twin.errors import StoreError
 from twin.store.atomic import write_json, write_npz, writing
-from twin.store.fingerprint import Maker, code_of, fingerprint
-from twin.store.made import inputs_digest, made_by
+from twin.store.fingerprint import Maker, code_of, fingerprint, inputs_digest, made_by
 
 MADE_BY = "made_by.json"  # file with the record of the code, in the folder of a whole
 _RECORD = "made_by"  # key of the record in the file of an item

@@ -219,9 +219,8 @@ class LeRobotWriter(FolderWriter):
         for name in self.about.numbers:
             shape, names = list(self.about.shape(name)), list(self.about.axes(name))
             features[channel_of(name).column] = {"dtype": "float32", "shape": shape, "names": names if len(shape) == 1 else ["pin", "axis"]}
-        features[TIME] = {"dtype": "float64", "shape": [1], "names": None}
-        features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
-        return features | {name: {"dtype": "int64", "shape": [1], "names": None} for name in COUNTERS}
+        kinds = {TIME: "float64", "timestamp": "float32"} | dict.fromkeys(COUNTERS, "int64")
+        return features | {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in kinds.items()}
 
     def _episode_row(self, episode: Episode, number: int, start: int, length: int, at: dict[str, int]) -> dict[str, Any]:
         row: dict[str, Any] = {"episode_index": number, "tasks": [episode.task], "length": length}
@@ -343,19 +342,15 @@ def _steps_of(folder: Path, row: dict[str, Any], about: About) -> Iterator[Recor
     path, number = folder / DATA_PATH.format(**{key: row[f"data/{key}"] for key in ("chunk_index", "file_index")}), row["episode_index"]
     columns = [image_column(view) for view in about.views]
     films = [_film_pictures(folder, row, about, column) for column in columns if f"videos/{column}/from_timestamp" in row]
-    with reading_tables(path) as parquet:
-        file = parquet.ParquetFile(path, page_checksum_verification=True)
-        leaf = next(k for k in range(len(file.schema)) if file.schema.column(k).path == "episode_index")
-        for group in range(file.num_row_groups):
-            statistics = file.metadata.row_group(group).column(leaf).statistics
-            if statistics is not None and statistics.has_min_max and not statistics.min <= number <= statistics.max:
-                continue
-            for line in file.read_row_group(group).to_pylist():
-                if line["episode_index"] == number:
-                    images = [next(film) for film in films] or [image_of(line[each]["bytes"], about.gray, str(path)) for each in columns]
-                    found = {name: np.asarray(line[channel_of(name).column], np.float32) for name in about.numbers}
-                    values = {name: value.reshape(about.shape(name)) for name, value in found.items()}
-                    yield RecordStep(images[0], float(line[TIME]), values, tuple(images[1:]))
+    with reading_tables(path):
+        dataset = library("pyarrow.dataset")
+        checked, own = dataset.ParquetFragmentScanOptions(page_checksum_verification=True), dataset.field("episode_index") == number
+        for rows in dataset.dataset(path).to_batches(filter=own, batch_size=ROWS, fragment_scan_options=checked):
+            for line in rows.to_pylist():
+                images = [next(film) for film in films] or [image_of(line[each]["bytes"], about.gray, str(path)) for each in columns]
+                found = {name: np.asarray(line[channel_of(name).column], np.float32) for name in about.numbers}
+                values = {name: value.reshape(about.shape(name)) for name, value in found.items()}
+                yield RecordStep(images[0], float(line[TIME]), values, tuple(images[1:]))
 
 
 def _film_pictures(folder: Path, row: dict[str, Any], about: About, column: str) -> Iterator[np.ndarray]:

@@ -109,18 +109,14 @@ def code_of(*makers: Maker, root: Path = ROOT) -> CodeOf:
     UnknownCodeError
         The source of one of them can't be read.
     """
-    return _code(root, tuple(sorted({_module_of(maker) for maker in makers})))
+    own = map(_unwrap, makers)
+    return _code(root, tuple(sorted({maker if isinstance(maker, str) else maker.__module__ for maker in own})))
 
 
 def name_of(maker: Maker) -> str:
     """Name of a function or class with its module, or name of a module."""
     maker = _unwrap(maker)
     return maker if isinstance(maker, str) else f"{maker.__module__}.{maker.__qualname__}"
-
-
-def _module_of(maker: Maker) -> str:
-    maker = _unwrap(maker)
-    return maker if isinstance(maker, str) else maker.__module__
 
 
 def _unwrap(maker: Maker) -> Maker:
@@ -257,11 +253,11 @@ def _is_text(part: object) -> bool:
 
 
 @cache
-def _version(distribution: str) -> str:
+def _version(distribution: str, otherwise: str = "of another origin") -> str:
     try:
         return metadata.version(distribution)
     except metadata.PackageNotFoundError:
-        return "of another origin"
+        return otherwise
 
 
 PROGRAM = "tactip-twin"
@@ -326,7 +322,4 @@ def made_by(*by: Maker, inputs: object = None, dated: bool = True) -> dict[str, 
 
 def program_version() -> str:
     """Version of this program, or "not installed"."""
-    try:
-        return metadata.version(PROGRAM)
-    except metadata.PackageNotFoundError:
-        return "not installed"
+    return _version(PROGRAM, "not installed")

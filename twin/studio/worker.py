@@ -20,7 +20,7 @@ from functools import cache, partial
 from multiprocessing import Pipe, connection
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from scenes.base import SpecError
 from scenes.object import ObjectSpec
@@ -78,22 +78,9 @@ class Failed:
     tracing: bool = False
 
 
-@dataclass(frozen=True)
-class _Trace:
-    solved: int
-    state: ContactState
-
-
-@dataclass(frozen=True)
-class _Save:
-    out: Path
-    obj: ObjectSpec
-    pose: PressedPose
-    state: ContactState
-    form: Form
-
-
 Outcome = Shading | Traced | Saved | Failed
+Job = tuple[Any, ...]
+"""``_trace`` or ``_save``, and its last arguments."""
 
 
 class Tracer:
@@ -120,7 +107,7 @@ class Tracer:
         self._ended = False
         self._one = threading.Lock()
         self._tracing = False
-        self._next: _Trace | None = None
+        self._next: Job | None = None
 
     def start(self) -> None:
         """Start the process, if it is not running yet. It is ready after some seconds."""
@@ -140,14 +127,14 @@ class Tracer:
         """Request a contact's light. One contact is traced at a time. Of further requests before its first pass only the newest is kept."""
         with self._one:
             if self._tracing:
-                self._next = _Trace(solved, state)
+                self._next = _trace, solved, state
                 return
             self._tracing = True
-        self._send(_Trace(solved, state))
+        self._send((_trace, solved, state))
 
     def save(self, out: Path, obj: ObjectSpec, pose: PressedPose, state: ContactState, form: Form) -> None:
         """Request a contact's files in a folder that exists."""
-        self._send(_Save(out, obj, pose, state, form))
+        self._send((_save, out, obj, pose, state, form))
 
     def outcomes(self) -> list[Outcome]:
         """Outcomes that have arrived since the last call; never waits."""
@@ -187,7 +174,7 @@ class Tracer:
             self._process.wait()
         self._here.close()
 
-    def _send(self, job: _Trace | _Save) -> None:
+    def _send(self, job: Job) -> None:
         self.start()
         if self._ended:
             return
@@ -199,12 +186,12 @@ def serve(number: int) -> None:
     """Run the process: receive the sensor and then jobs through a file descriptor, and send outcomes, until that is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C in the terminal ends the studio, which then ends this process
     there = getattr(connection, "PipeConnection", Connection)(number)  # Windows has a class of its own for pipes
-    jobs: deque[_Trace | _Save | None] = deque()
+    jobs: deque[Job | None] = deque()
 
     def overtaken(wait_s: float) -> bool:
         while there.poll(0 if jobs else wait_s):
             jobs.append(there.recv())
-        return any(job is None or isinstance(job, _Trace) for job in jobs)
+        return any(job is None or job[0] is _trace for job in jobs)
 
     try:
         spec: SensorSpec = there.recv()
@@ -212,32 +199,34 @@ def serve(number: int) -> None:
         for shading in _catch_render_errors(lambda: iter([dome_shading(spec)]), tracing=True):
             there.send(shading)
         while (job := jobs.popleft() if jobs else there.recv()) is not None:
-            do = partial(_trace, job, renderer, overtaken) if isinstance(job, _Trace) else partial(_save, job, simulator)
-            for outcome in _catch_render_errors(do, tracing=isinstance(job, _Trace)):
+            work, *given = job
+            tools = (renderer, overtaken) if work is _trace else (simulator,)
+            for outcome in _catch_render_errors(partial(work, *tools, *given), tracing=work is _trace):
                 there.send(outcome)
     except (EOFError, OSError):
         return
 
 
-def _trace(job: _Trace, renderer: Callable[[], Renderer], overtaken: Callable[[float], bool]) -> Iterator[Outcome]:
+def _trace(renderer: Callable[[], Renderer], overtaken: Callable[[float], bool], solved: int, state: ContactState) -> Iterator[Outcome]:
     """Trace a contact pass by pass, until a newer one has ``overtaken`` it."""
     samples = [max(1, renderer().spp // part) for part in PARTS]
     started = time.perf_counter()
-    for k, light in enumerate(renderer().refine(job.state, job.solved, samples=samples)):
+    for k, light in enumerate(renderer().refine(state, solved, samples=samples)):
         if k == 0 or k == len(samples) - 1:
-            yield Traced(job.solved, light, 1e3 * (time.perf_counter() - started), rough=k == 0)
+            yield Traced(solved, light, 1e3 * (time.perf_counter() - started), rough=k == 0)
         if overtaken(SHOWN_S if k == 0 else 0.0):
             return
 
 
-def _save(job: _Save, simulator: Callable[[], Simulator]) -> Iterator[Outcome]:
+def _save(
+    simulator: Callable[[], Simulator], out: Path, obj: ObjectSpec, pose: PressedPose, state: ContactState, form: Form
+) -> Iterator[Outcome]:
     from twin.one_contact import write_contact  # imports matplotlib, which no picture of the page needs
 
     made = simulator()
     with SkinPainter() as painter:
-        painter.draw_contact(made.solver.mesh, made.spec.pins, job.state, build_field(job.obj))
-        rendered = made.render(job.state, form=job.form)
-        yield Saved(write_contact(job.out, made, job.obj, job.pose, job.state, rendered, painter)[0])
+        painter.draw_contact(made.solver.mesh, made.spec.pins, state, build_field(obj))
+        yield Saved(write_contact(out, made, obj, pose, state, made.render(state, form=form), painter)[0])
 
 
 def _catch_render_errors(make: Callable[[], Iterator[Outcome]], *, tracing: bool = False) -> Iterator[Outcome]:

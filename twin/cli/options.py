@@ -95,10 +95,8 @@ NoContact = Annotated[
 Tuning = Annotated[Path | None, Option("--pipeline", metavar="FILE.toml", help="pin detection of 'twin tune', instead of the sensor's own")]
 # Further formats in which a record can be kept, as in ``twin.records.ALSO``, whose import would load the pin detection.
 AlsoFormat = StrEnum("AlsoFormat", {"LEROBOT": "lerobot", "HUGGINGFACE": "huggingface", "MCAP": "mcap"})
-Also = Annotated[
-    list[AlsoFormat] | None,
-    Option("--also", help="also write this format, in a subfolder of that name; may be repeated ('twin convert --help')"),
-]
+ALSO = "also write this format, in a subfolder of that name; may be repeated ('twin convert --help')"
+Also = Annotated[list[AlsoFormat] | None, Option("--also", help=ALSO)]
 PlainLight = Annotated[bool, Option("--plain-light", help="render the twin's frames with direct light alone, without path tracing")]
 ServoName = Annotated[str, Option("--servo", help="gains, speeds and the object's place: a name, or a TOML file")]
 

@@ -25,15 +25,10 @@ from twin.records.session import is_session, rig_records, session_records
 from twin.store import writes
 from twin.types import Frame, ReadableResult
 
-READERS: dict[str, Callable[[Path], Records]] = {
-    RecordingWriter.FORMAT: recording_records,
-    LeRobotWriter.FORMAT: lerobot_records,
-    HuggingFaceWriter.FORMAT: huggingface_records,
-    Ros2Writer.FORMAT: ros2_records,
-}
-"""Function that reads the records of each format."""
 WRITERS: dict[str, type[FolderWriter]] = {each.FORMAT: each for each in (RecordingWriter, LeRobotWriter, HuggingFaceWriter, Ros2Writer)}
 """Class that writes each format."""
+READERS = dict(zip(WRITERS, (recording_records, lerobot_records, huggingface_records, ros2_records), strict=True))
+"""Function that reads the records of each format."""
 FORMATS = tuple(READERS)
 """Formats that can be written."""
 ALSO = tuple(name for name in FORMATS if name != RecordingWriter.FORMAT)

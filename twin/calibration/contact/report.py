@@ -13,10 +13,8 @@ from twin.calibration.contact.parameters import DETERMINED, Z90, FittedParameter
 from twin.calibration.contact.simulate import CalibrationSetup
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.frames import distinct_stems
-from twin.report.charts import new_figure, write_chart
-from twin.report.page import Page, PagePicture
-from twin.report.plots import draw_displacement, enlargement
-from twin.report.table import Cell, Column, number
+from twin.report.charts import draw_displacement, enlargement, new_figure, write_chart
+from twin.report.page import Cell, Column, Page, PagePicture, number
 from twin.rig.kinematics import rig_of
 from twin.store import made_by, write_json
 

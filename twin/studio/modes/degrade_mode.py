@@ -14,10 +14,9 @@ from twin.optics.preview import Shading
 from twin.pins import make_detector, nominal_reference, shipped_detector
 from twin.pins.pipeline import Pipeline
 from twin.studio.contact import ContactAnswer
-from twin.studio.live_page import frame_pictures
 from twin.studio.modes.mode import PageMode
 from twin.studio.modes.twin_mode import TwinMode
-from twin.studio.page import StudioPage, put
+from twin.studio.page import StudioPage, frame_pictures, put
 from twin.studio.pictures import badge, estimate_table, paragraph
 from twin.studio.pose import ObjectPose
 from twin.types import Form

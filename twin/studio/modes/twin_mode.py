@@ -17,11 +17,10 @@ from twin.estimate import SensorModel, readable_labels
 from twin.frames.images import write_image
 from twin.objects import build_field
 from twin.pins import nominal_reference
-from twin.report.table import force_interval
+from twin.report.page import force_interval
 from twin.studio.contact import ContactAnswer, ContactSetup, Light, MovingContact
-from twin.studio.live_page import frame_pictures
 from twin.studio.modes.mode import PageMode
-from twin.studio.page import LineChart, StudioPage, put, value_of
+from twin.studio.page import LineChart, StudioPage, frame_pictures, put, value_of
 from twin.studio.pictures import FilmWriter, OverlayChoices, badge, estimate_table, number_table, paragraph, pins_found
 from twin.studio.pose import LIMITS, NAMES, ObjectPose, PressedPose, readable_name, unit_of
 from twin.studio.scene import FULL_SCALE, PinColour, Scene

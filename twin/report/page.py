@@ -138,9 +138,8 @@ def number(value: object, digits: int = 3, *, decimals: int | None = None, signe
         else:
             decimals = max(0, digits - 1 - _power(size, digits)) if size else 0
     text = f"{abs(size):.{decimals}f}"
-    if not float(text):
-        sign = ""  # a number that is rounded to zero has no sign
-    return sign + _group_digits(text)
+    grouped = f"{abs(size):,.{decimals}f}".replace(",", GROUP) if float(text) >= GROUPED_FROM else text
+    return (sign if float(text) else "") + grouped  # a number that is rounded to zero has no sign
 
 
 def column(values: Sequence[object], digits: int = 3, *, decimals: int | None = None, signed: bool = False) -> list[str]:
@@ -168,11 +167,6 @@ def is_number(value: object) -> TypeGuard[Real]:
 def _power(size: float, digits: int) -> int:
     """Power of ten of a number's first digit after rounding to ``digits`` digits (9.996 to three is 10.0: 1)."""
     return int(f"{abs(size):.{digits - 1}e}".partition("e")[2])
-
-
-def _group_digits(text: str) -> str:
-    whole, point, rest = text.partition(".")
-    return (f"{int(whole):,}".replace(",", GROUP) if int(whole) >= GROUPED_FROM else whole) + point + rest
 
 
 @dataclass(frozen=True)

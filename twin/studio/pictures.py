@@ -89,8 +89,7 @@ def estimate_table(estimate: Estimate | None, truth: Mapping[str, float], *, mis
         named = label if label == name else f"{label} ({name})"  # its sign and zero are those of the recordings' column
         cells = f"<td>{escape(', '.join(filter(None, (named, unit))))}</td><td>{value:+.2f}</td><td>{low:+.2f} to {high:+.2f}</td>"
         rows.append(f"<tr>{cells}<td class='{kind}'>{true}</td></tr>")
-    head = "<tr><th>estimate</th><th>value</th><th>90 % interval</th><th>truth</th></tr>"
-    return f"<table>{head}{''.join(rows)}</table>"
+    return f"<table><tr><th>estimate</th><th>value</th><th>90 % interval</th><th>truth</th></tr>{''.join(rows)}</table>"
 
 
 def number_table(rows: Mapping[str, str]) -> str:

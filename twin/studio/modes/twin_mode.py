@@ -18,13 +18,14 @@ from twin.frames.images import write_image
 from twin.objects import build_field
 from twin.pins import nominal_reference
 from twin.report.page import force_interval
+from twin.store.atomic import make_folder
 from twin.studio.contact import ContactAnswer, ContactSetup, Light, MovingContact
 from twin.studio.modes.mode import PageMode
 from twin.studio.page import LineChart, StudioPage, frame_pictures, put, value_of
 from twin.studio.pictures import FilmWriter, OverlayChoices, badge, estimate_table, number_table, paragraph, pins_found
 from twin.studio.pose import LIMITS, NAMES, ObjectPose, PressedPose, readable_name, unit_of
 from twin.studio.scene import FULL_SCALE, PinColour, Scene
-from twin.studio.state import LAST_STATE, StudioState, Way, heading, make_folder, next_path, read_trajectory, save_trajectory, tap_and_shear
+from twin.studio.state import LAST_STATE, StudioState, Way, heading, next_path, read_trajectory, save_trajectory, tap_and_shear
 from twin.studio.worker import Tracer, Worker
 from twin.types import Form
 

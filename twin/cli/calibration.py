@@ -31,9 +31,8 @@ if TYPE_CHECKING:
     from twin.calibration.go_on import WholeSensor
     from twin.calibration.optics import OpticsCalibration
 
-Columns = Annotated[
-    list[str] | None, Option("--column", metavar="KEY=NAME", help="a table's column: Fz=normal, pose_3=-height, Fz=0.001*mN; repeat it")
-]
+COLUMN = "a table's column: Fz=normal, pose_3=-height, Fz=0.001*mN; repeat it"
+Columns = Annotated[list[str] | None, Option("--column", metavar="KEY=NAME", help=COLUMN)]
 
 
 def columns_in(pairs: list[str] | None) -> dict[str, str]:

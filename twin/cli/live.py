@@ -314,9 +314,8 @@ def grasp(
 
 emulate = group("emulate", "Emulate a device on this machine.\n\nIt prints 'ready ...' when it listens, and runs until SIGTERM or Ctrl-C.")
 
-FaultOption = Annotated[
-    list[str] | None, Option("--fault", metavar="NAME[=VALUE]", help="switch a fault on; '--fault help' lists them; may be repeated")
-]
+FAULT = "switch a fault on; '--fault help' lists them; may be repeated"
+FaultOption = Annotated[list[str] | None, Option("--fault", metavar="NAME[=VALUE]", help=FAULT)]
 TimeScale = Annotated[float, Option("--time-scale", help="speed relative to the real arm", min=1e-3)]
 
 

@@ -55,9 +55,8 @@ QUALITY = "rasterised without noise, or path-traced with more and more samples"
 
 Sensor = Annotated[str, Option("--sensor", metavar="S", help="sensor name ('twin sensors') or specification file")]
 Object = Annotated[str, Option("--object", metavar="O", help="object name ('twin objects'), specification or mesh file")]
-TouchedObject = Annotated[
-    str | None, Option("--object", metavar="O", help="object name, specification or mesh file; the experiment's own if not given")
-]
+TOUCHED = "object name, specification or mesh file; the experiment's own if not given"
+TouchedObject = Annotated[str | None, Option("--object", metavar="O", help=TOUCHED)]
 Out = Annotated[Path, Option("--out", metavar="DIR", help="folder to write to; made if missing")]
 Force = Annotated[bool, Option("--force", help="overwrite files that this program did not write")]
 FormOrAuto = Annotated[Form | None, Option("--form", help="form of the frames; found from size and content if not given")]
@@ -89,9 +88,8 @@ Threads = Annotated[int | None, Option("--threads", min=1, max=MOST_THREADS, hel
 Workers = Annotated[int, Option("--workers", min=1, metavar="N", show_default="one for each core", help="processes on this machine")]
 Pair = tuple[float, float]
 Table = Annotated[Path | None, Option("--table", metavar="CSV", help="table of labels, if it is not targets.csv beside the frames")]
-NoContact = Annotated[
-    Path | None, Option("--no-contact", metavar="FRAME", help="frame without contact, if it is not init_0.png beside the frames")
-]
+NO_CONTACT = "frame without contact, if it is not init_0.png beside the frames"
+NoContact = Annotated[Path | None, Option("--no-contact", metavar="FRAME", help=NO_CONTACT)]
 Tuning = Annotated[Path | None, Option("--pipeline", metavar="FILE.toml", help="pin detection of 'twin tune', instead of the sensor's own")]
 # Further formats in which a record can be kept, as in ``twin.records.ALSO``, whose import would load the pin detection.
 AlsoFormat = StrEnum("AlsoFormat", {"LEROBOT": "lerobot", "HUGGINGFACE": "huggingface", "MCAP": "mcap"})
@@ -108,9 +106,8 @@ def _even(value: int) -> int:
     return value
 
 
-Elements = Annotated[
-    int, Option("--elements", min=6, max=64, callback=_even, help="elements along each side of the skin's grid; even"), Formerly("across")
-]
+GRID = "elements along each side of the skin's grid; even"
+Elements = Annotated[int, Option("--elements", min=6, max=64, callback=_even, help=GRID), Formerly("across")]
 
 
 def names_in(text: str) -> list[str]:

@@ -8,7 +8,7 @@ sys.path[:0] = [str(HERE), str(HERE.parent)]
 
 from generators import sphinx_steps  # noqa: E402  (its folder is on the path only now)
 
-from twin.store.made import program_version  # noqa: E402
+from twin.store.fingerprint import program_version  # noqa: E402
 
 project = "TacTip twin"
 author = "the authors of the TacTip twin"

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping
 from importlib import import_module
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec
-from importlib.util import find_spec
 from types import ModuleType
 from typing import Any
 
@@ -45,7 +44,7 @@ class WhenImported(MetaPathFinder):
     """
 
     def __init__(self, module: str, then: Callable[[], object]) -> None:
-        self._module, self._then, self._asking = module, then, False
+        self._module, self._then = module, then
         if module in sys.modules:
             then()
         else:
@@ -53,13 +52,10 @@ class WhenImported(MetaPathFinder):
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         """The module's own specification, with a loader that calls the function at its end; None for other modules."""
-        if name != self._module or self._asking:
+        if name != self._module:
             return None
-        self._asking = True
-        try:
-            spec = find_spec(name)
-        finally:
-            self._asking = False
+        others = (finder.find_spec(name, path, target) for finder in sys.meta_path if finder is not self)
+        spec = next(filter(None, others), None)
         if spec is not None and spec.loader is not None:
             load = spec.loader.exec_module
 

@@ -13,10 +13,9 @@ from twin.optics.render import write_exr
 from twin.pins.graph import make_graph
 from twin.pins.pipeline import Pipeline
 from twin.progress import Progress, silent, stage
-from twin.report.charts import save_figure
-from twin.report.plots import ObservedFrame, contact_panel
+from twin.report.charts import ObservedFrame, contact_panel, save_figure
+from twin.report.page import force_interval
 from twin.report.skin3d import SkinPainter, displaced_skin, write_surface
-from twin.report.table import force_interval
 from twin.simulator import RenderedFrame, Simulator
 from twin.store import made_by, write_json, write_npz, writes
 from twin.types import ContactState, FloatArray, Form, Quality, ReadableResult

@@ -16,8 +16,7 @@ from twin.pins import DetectorSpec, Pipeline, with_detector
 from twin.pins.batch import draw_overlay
 from twin.pins.check import Finding, Grade, examine
 from twin.progress import Progress, silent, stage
-from twin.report.page import Page, PagePicture
-from twin.report.table import Cell
+from twin.report.page import Cell, Page, PagePicture
 from twin.store import writes, writes_file
 from twin.types import Form, Frame, ReadableResult
 

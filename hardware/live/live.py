@@ -28,7 +28,7 @@ from twin.pins import Pipeline
 from twin.records import KeptAlso
 from twin.records.session import SESSION_FILES, SessionWriter
 from twin.store import output
-from twin.studio.live_page import LiveFrame, LivePage
+from twin.studio.page import LiveFrame, LivePage
 from twin.types import FIRST, NONE, Frame, Observation
 
 # Number of newest times of each kind from which the figures are computed.

@@ -24,10 +24,9 @@ from twin.estimate import Estimate, PinsAlone, SensorModel, pins_in
 from twin.pins import Pipeline
 from twin.pins.check import Grade, examine
 from twin.records.session import SessionWriter
-from twin.studio.live_page import LiveFrame, chart_values, frame_numbers, frame_pictures
 from twin.studio.modes.mode import PageMode
 from twin.studio.modes.twin_mode import MODEL_LOADING, TwinMode
-from twin.studio.page import LineChart, StudioPage, put
+from twin.studio.page import LineChart, LiveFrame, StudioPage, chart_values, frame_numbers, frame_pictures, put
 from twin.studio.pictures import badge, numbers_html, paragraph
 from twin.studio.studio import LIVE, StudioPlan
 from twin.types import Frame

@@ -29,8 +29,7 @@ from twin.progress import Progress, silent, stage
 from twin.records import KeptAlso
 from twin.records.session import SessionWriter, plain
 from twin.report.charts import write_chart
-from twin.report.page import Page, PagePicture
-from twin.report.table import Cell, Column, write_rows
+from twin.report.page import Cell, Column, Page, PagePicture, write_rows
 from twin.rig.arm_pose import matrix_of, pose_of
 from twin.rig.kinematics import Mounting
 from twin.store import write_json, writes

@@ -13,8 +13,7 @@ from matplotlib.figure import Figure
 from hardware.rig.geometry import PlacedObject
 from hardware.servo.loop import Reading, StepRecord, tangent_of
 from twin.report.charts import muted_colour, new_figure
-from twin.report.table import write_table
-from twin.report.themes import BLUE, RED
+from twin.report.page import BLUE, RED, write_table
 from twin.rig.arm_pose import matrix_of
 from twin.rig.kinematics import Mounting
 

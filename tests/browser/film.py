@@ -18,11 +18,11 @@ from studio_client import StudioClient
 from hardware.live.studio_mode import LiveMode
 from scenes import load_sensor
 from training.estimate.loading import models_by_sensor
+from twin.studio.pictures import FilmWriter
 from twin.studio.pose import ObjectPose
 from twin.studio.scene import quaternion
 from twin.studio.state import first_state
 from twin.studio.studio import Studio, StudioPlan
-from twin.studio.video import FilmWriter
 
 SENSOR, OBJECT = "mg400-331", "sphere"
 RATE_HZ = 8.0  # poses of the film in a second

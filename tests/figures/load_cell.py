@@ -17,7 +17,7 @@ from twin.calibration.size import of_radius
 from twin.geometry.solid import Resolution
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
-from twin.report.table import force_interval
+from twin.report.page import force_interval
 from twin.rig.contact import RigContact
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel

@@ -48,7 +48,7 @@ from twin.pins.batch import voronoi_map
 from twin.records import open_records
 from twin.records.ros2 import decode
 from twin.rig.kinematics import Mounting
-from twin.studio.live_page import LivePage, frame_pictures
+from twin.studio.page import LivePage, frame_pictures
 from twin.types import Form, Frame
 
 STEPS = 6

@@ -15,11 +15,10 @@ import pytest
 from twin.errors import ContactError, TwinError
 from twin.studio.contact import Light, SolvedMesh
 from twin.studio.page import PORTS_TRIED, StudioPage, free_port, keep_upload
+from twin.studio.pictures import RATE_HZ, FilmWriter
 from twin.studio.pose import NAMES, ObjectPose
 from twin.studio.state import LAST_STATE, MOST_BYTES, StudioState, first_state, read_trajectory, save_trajectory, tap_and_shear
-from twin.studio.tracing import Failed, Traced
-from twin.studio.video import RATE_HZ, FilmWriter
-from twin.studio.worker import Newest, Worker
+from twin.studio.worker import Failed, Newest, Traced, Worker
 
 WAIT_S = 20.0
 

@@ -11,7 +11,7 @@ from twin.mechanics.solver import SkinSolver
 from twin.optics.preview import Shading
 from twin.studio.camera import dome_window
 from twin.studio.pose import PressedPose
-from twin.studio.tracing import Failed, Saved, Traced, Tracer
+from twin.studio.worker import Failed, Saved, Traced, Tracer
 from twin.types import Form
 
 SENSOR = load_sensor("mg400-127")

@@ -28,10 +28,8 @@ from twin.evaluation.pictures.compare import ImageFigures, Pair
 from twin.evaluation.pictures.statistics import RADIAL_MEASURES, RadialRow
 from twin.mechanics.path import ContactPose
 from twin.pins import make_graph, nominal_reference
-from twin.report.charts import new_figure, write_chart
-from twin.report.page import Page
-from twin.report.plots import ObservedFrame
-from twin.report.table import write_table
+from twin.report.charts import ObservedFrame, new_figure, write_chart
+from twin.report.page import Page, write_table
 from twin.types import Form, Frame
 
 SENSOR = "mg400-127"

@@ -12,8 +12,7 @@ from scenes.rig import RigSpec
 from training.environments.batch import Options
 from training.generation.config import GenerationConfig
 from twin.cli import command_line
-from twin.cli.command import App, as_function
-from twin.cli.options import Formerly
+from twin.cli.options import App, Formerly, as_function
 from twin.errors import OptionError, warn_once
 from twin.types import Form, Quality
 

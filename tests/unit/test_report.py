@@ -17,22 +17,34 @@ from made_up_pages import HOSTILE, PAGES
 from sound_page import PageReader, read_sound_page
 
 from twin.report.charts import muted_colour, new_figure, write_chart
-from twin.report.page import Page, PagePicture, bad, code, good, link_to, sentence, strong
-from twin.report.table import (
+from twin.report.page import (
+    DARK,
     GROUP,
+    LIGHT,
     LONGEST,
     MINUS,
     NOTHING,
+    SERIES,
     Cell,
     Column,
+    Page,
+    PagePicture,
+    Theme,
+    bad,
+    code,
     column,
+    dark_of,
     force_interval,
+    good,
+    link_to,
     make_table,
     number,
+    sentence,
+    strong,
+    stylesheet,
     write_rows,
     write_table,
 )
-from twin.report.themes import DARK, LIGHT, SERIES, Theme, dark_of, stylesheet
 
 TEXT_CONTRAST = 4.5  # WCAG 2.1, 1.4.3, level AA
 LINE_CONTRAST = 3.0  # WCAG 2.1, 1.4.11

@@ -16,7 +16,7 @@ from scenes import load_sensor
 from training.estimate.estimator import PoseEstimate
 from twin.errors import ExtraError, OptionError
 from twin.pins import Pipeline
-from twin.studio.live_page import LiveFrame
+from twin.studio.page import LiveFrame
 from twin.types import Form
 
 

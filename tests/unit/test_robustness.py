@@ -9,7 +9,7 @@ from drawn_frames import drawn_frame
 
 from training.estimate.estimator import PoseEstimator
 from training.studies.judging import CHANGES, measure_changes
-from twin.report.table import write_table
+from twin.report.page import write_table
 from twin.types import Form, Frame
 
 

@@ -37,7 +37,6 @@ from twin.store import (
     kept_json,
     lock_folder,
     made_by,
-    remove_parts,
     require_same_code,
     write_bytes,
     write_json,
@@ -227,7 +226,7 @@ def test_killed_between_writing_and_replacing_the_old_file_is_left(tmp_path):
     done = subprocess.run([sys.executable, "-c", KILLED, str(path)], env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True)
     assert done.returncode == -signal.SIGKILL, done.stderr
     assert path.read_text() == "old" and len(list(tmp_path.iterdir())) == 2
-    remove_parts(tmp_path)
+    atomic.remove_parts(tmp_path)
     assert list(tmp_path.iterdir()) == [path]
 
 

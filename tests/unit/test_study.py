@@ -11,7 +11,7 @@ from training.runs.run import is_finished, train_run
 from training.studies.tac_vgnn.models import PeakMemory, measure_training, plan_run, table_row, train_all
 from training.studies.tac_vgnn.study import AreaChange, compare_graphs, ordering, recorded_contacts
 from twin.pins import make_graph
-from twin.report.table import write_table
+from twin.report.page import write_table
 
 
 def test_graphs_have_the_edges_their_kind_implies(data):

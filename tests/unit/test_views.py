@@ -9,8 +9,7 @@ from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.objects import build_field
 from twin.report import skin3d
-from twin.report.charts import new_figure
-from twin.report.plots import ENLARGEMENTS, area_surface_figure, draw_area_change, draw_displacement, enlargement
+from twin.report.charts import ENLARGEMENTS, area_surface_figure, draw_area_change, draw_displacement, enlargement, new_figure
 
 
 def test_a_vtk_that_is_killed_gives_a_plain_picture_and_a_reason(tmp_path, monkeypatch):

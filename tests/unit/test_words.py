@@ -60,7 +60,7 @@ PARTICIPLES_ALLOWED = {
     ("twin/camera/capture.py", "shared"),
     ("twin/camera/capture.py", "sharpened"),
     ("twin/camera/capture.py", "vignetted"),
-    ("twin/cli/command.py", "_hidden"),
+    ("twin/cli/options.py", "_hidden"),
     ("twin/compiled.py", "compiled"),
     ("twin/evaluation/degradation/conditions/body.py", "broken"),
     ("twin/evaluation/degradation/conditions/body.py", "faded"),

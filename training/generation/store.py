@@ -24,7 +24,7 @@ from training.generation.make import REST, UNITS, Outcome, make_contact
 from twin import store
 from twin.errors import ErrorsAs, StoreError, format_count
 from twin.frames.truth import TRUTH, image_name
-from twin.store import write_text
+from twin.store import atomic, write_text
 
 # Largest size of a JSON file of a data set, bytes. A sensor's measured tables are its largest part.
 LARGEST_RECORD = 100_000_000
@@ -65,7 +65,7 @@ class Store:
         self._check_config()
         try:
             for place in (folder, folder / RECORDS, self.pictures):
-                store.remove_parts(place)
+                atomic.remove_parts(place)
             (folder / RECORDS).mkdir(exist_ok=True)
             if config.images != "none":
                 self.pictures.mkdir(exist_ok=True)
@@ -119,11 +119,11 @@ class Store:
             write_text(self.folder / "meta.json", json.dumps(self._meta(count)))
             for name, rows in tables.items():
                 write_text(self.folder / name, _csv(rows, FAILURE_COLUMNS if name == "failures.csv" else None))
-            store.replace_folder(truth.path, self.folder / TRUTH)
+            atomic.replace_folder(truth.path, self.folder / TRUTH)
         except StoreError as error:
             raise self._unfinished_error(error) from error
         except OSError as error:
-            raise self._unfinished_error(store.unwritten(self.folder / TRUTH, error)) from error
+            raise self._unfinished_error(atomic.unwritten(self.folder / TRUTH, error)) from error
         return len(tables["targets.csv"])
 
     def _add_rows(self, tables: dict, index: int, arrays: dict, notes: dict) -> None:

@@ -30,7 +30,7 @@ from training.runs.run_files import CHECKPOINT, CONFIG, TENSORS, damage_error, r
 from twin.errors import ErrorsAs
 from twin.frames.forms import blob_spec
 from twin.progress import Step, unheard
-from twin.report.table import write_rows
+from twin.report.page import write_rows
 from twin.store import fingerprint, write_text, writes
 
 RUN_FILES = (CONFIG, "curves.csv", TENSORS)

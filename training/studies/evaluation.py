@@ -30,7 +30,7 @@ from twin.mechanics.skin_map import ContactMaps
 from twin.pins.batch import recording_reference
 from twin.progress import Progress, silent, stage
 from twin.report.charts import ink, save_figure, sequential, sized_figure
-from twin.report.table import write_table
+from twin.report.page import write_table
 from twin.store import output, write_npz, writes
 from twin.types import FloatArray, Frame, ImageArray, ReadableResult
 

@@ -26,7 +26,7 @@ from twin.estimate import readable_labels
 from twin.frames import open_recording
 from twin.progress import Step, unheard
 from twin.report.charts import new_figure, save_figure
-from twin.report.table import write_table
+from twin.report.page import write_table
 from twin.rig.labels import EXECUTED_FILES
 from twin.store import made_by, write_json
 from twin.types import Form, Frame

@@ -14,8 +14,7 @@ from training.data.targets import CONTACT, UNITS, unit_of
 from twin.errors import FrameError
 from twin.progress import Progress, silent, stage
 from twin.report.charts import muted_colour, new_figure, write_chart
-from twin.report.page import Page, PagePicture
-from twin.report.table import Column, number, write_table
+from twin.report.page import Column, Page, PagePicture, number, write_table
 from twin.rig.labels import as_executed
 from twin.store import made_by, write_json, writes
 from twin.types import Form, ReadableResult

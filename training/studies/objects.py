@@ -23,9 +23,7 @@ from training.studies.sim_to_real.steps import contact_of, train_in_twin
 from twin.estimate import readable_labels
 from twin.progress import Progress, silent, stage
 from twin.report.charts import muted_colour, sized_figure, write_chart
-from twin.report.page import Page, PagePicture, sentence, strong
-from twin.report.table import Column, number, write_table
-from twin.report.themes import BLUE, RED
+from twin.report.page import BLUE, RED, Column, Page, PagePicture, number, sentence, strong, write_table
 from twin.store import writes
 from twin.types import FINE, ReadableResult
 

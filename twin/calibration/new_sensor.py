@@ -30,8 +30,7 @@ from twin.pins.labelling.identify import STEADY, SURE_AHEAD, SURE_EXPLAINED, Can
 from twin.pins.labelling.rest import Rest, rest_of, turn_of
 from twin.pins.pipeline import Pipeline
 from twin.progress import Progress, silent, stage
-from twin.report.page import Page, PagePicture
-from twin.report.table import Column
+from twin.report.page import Column, Page, PagePicture
 from twin.store import output, write_text, writes_file
 from twin.types import Form, Frame
 

@@ -36,8 +36,7 @@ from twin.optics.render import Renderer
 from twin.pins.labelling.rest import require_even
 from twin.pins.pipeline import Pipeline
 from twin.progress import Bar, Progress, Step, report_each, silent, stage, unheard
-from twin.report.page import Page, PagePicture, code
-from twin.report.table import Column
+from twin.report.page import Column, Page, PagePicture, code
 from twin.store import KEPT, Item, inputs_digest, kept_arrays, kept_json, output, writes_file
 from twin.types import Form, Frame, ReadableResult
 

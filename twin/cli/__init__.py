@@ -20,8 +20,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from twin.cli.command import App
-from twin.cli.options import as_options
+from twin.cli.options import App, as_options
 from twin.errors import OptionError, StoreError, TwinError
 from twin.signals import end_interrupted, end_on_sigterm
 
@@ -92,7 +91,7 @@ app = App(name="twin", cls=_Commands, no_args_is_help=True, rich_markup_mode=Non
 
 
 def _print_version(asked: bool) -> None:
-    from twin.store.made import program_version
+    from twin.store.fingerprint import program_version
 
     if asked:
         print(f"twin {program_version()}")

@@ -31,9 +31,8 @@ if TYPE_CHECKING:
     from twin.calibration.go_on import WholeSensor
     from twin.calibration.optics import OpticsCalibration
 
-Columns = Annotated[
-    list[str] | None, Option("--column", metavar="KEY=NAME", help="a table's column: Fz=normal, pose_3=-height, Fz=0.001*mN; repeat it")
-]
+COLUMN = "a table's column: Fz=normal, pose_3=-height, Fz=0.001*mN; repeat it"
+Columns = Annotated[list[str] | None, Option("--column", metavar="KEY=NAME", help=COLUMN)]
 
 
 def columns_in(pairs: list[str] | None) -> dict[str, str]:
@@ -358,16 +357,14 @@ def _list_conditions(asked: bool) -> None:
         raise Exit
 
 
+PIPELINES = "twin, legacy, adaptive, fixed, simple, log, dog, doh, a file of 'twin tune', or your own as FILE.py:FUNCTION"
+
+
 @app.command("robustness", goes_on=True)
 def robustness(
     sensor: options.Sensor,
     out: options.Out,
-    pipeline: Annotated[
-        list[str] | None,
-        Option(
-            metavar="P", help="twin, legacy, adaptive, fixed, simple, log, dog, doh, a file of 'twin tune', or your own as FILE.py:FUNCTION"
-        ),
-    ] = None,
+    pipeline: Annotated[list[str] | None, Option(metavar="P", help=PIPELINES)] = None,
     model: Annotated[list[Path] | None, Option(metavar="RUN", help="folder of a trained model")] = None,
     conditions: Annotated[Path | None, Option(metavar="FILE", help="TOML file: which conditions, ranges, steps, pairs")] = None,
     frames: Annotated[Path | None, Option(metavar="DIR", help="real frames instead of rendered ones")] = None,

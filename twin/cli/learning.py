@@ -35,6 +35,9 @@ if TYPE_CHECKING:
 TaskName = Annotated[str, Option("--task", metavar="T", help="EdgeFollow, SurfaceFollow, ContourFollow, GentlePress, ...")]
 RandomiseEpisodes = Annotated[str | None, Option("--randomise", metavar="R", help="domain randomisation of episodes, e.g. moves")]
 OwnSurrogate = Annotated[Path | None, Option("--surrogate", metavar="FILE", help="surrogate model of your own sensor")]
+HISTORY, ESTIMATOR = "history-dependent friction; switch it off to measure its effect", "first train a state estimator of place and force"
+FrictionHistory = Annotated[bool, Option("--friction-history/--no-friction-history", help=HISTORY), Formerly("memory")]
+StateEstimator = Annotated[bool, Option("--state-estimator/--no-state-estimator", help=ESTIMATOR), Formerly("sight")]
 TaskObjects = Annotated[str | None, Option("--objects", callback=each_once, help="objects instead of the task's, with commas")]
 
 
@@ -376,14 +379,8 @@ def learn(
     randomise: RandomiseEpisodes = None,
     surrogate: OwnSurrogate = None,
     objects: TaskObjects = None,
-    friction_history: Annotated[
-        bool,
-        Option("--friction-history/--no-friction-history", help="history-dependent friction; switch it off to measure its effect"),
-        Formerly("memory"),
-    ] = True,
-    state_estimator: Annotated[
-        bool, Option("--state-estimator/--no-state-estimator", help="first train a state estimator of place and force"), Formerly("sight")
-    ] = True,
+    friction_history: FrictionHistory = True,
+    state_estimator: StateEstimator = True,
     minutes: Annotated[float, Option(min=0, callback=finite, help="maximum time")] = 30.0,
     environments: Annotated[int, Option(min=2, help="number of environments that are stepped together")] = 32,
     fem: Annotated[int, Option(min=0, metavar="N", help="episodes with finite elements for the evaluation")] = 0,

@@ -29,38 +29,23 @@ if TYPE_CHECKING:
 # Sensor whose trained weights are shipped with the package.
 SHIPPED_MODEL = Path("mg400-331")
 Model = Annotated[Path, Option("--model", metavar="RUN", help="folder of a run, or a sensor whose weights are shipped")]
-Camera = Annotated[
-    str,
-    Option(
-        "--camera", metavar="C", help="twin, a number, /dev/videoN, http://..., rtsp://..., ros2:/TOPIC, a folder or video, mujoco:SCENE"
-    ),
-]
+CAMERAS = "twin, a number, /dev/videoN, http://..., rtsp://..., ros2:/TOPIC, a folder or video, mujoco:SCENE"
+Camera = Annotated[str, Option("--camera", metavar="C", help=CAMERAS)]
 Steps = Annotated[int | None, Option("--steps", min=1, help="number of steps, instead of once around the object")]
 Record = Annotated[bool, Option("--record", help="keep every frame and step in OUT/session")]
 NoiseSeed = Annotated[int, Option("--seed", min=0, help="seed of the twin's noise")]
 KnownPlace = Annotated[bool, Option("--known-place", help="the object stands exactly at --servo: measure errors against it")]
-ArmOption = Annotated[
-    str,
-    Option(
-        "--arm",
-        metavar="A",
-        help="simulated, simulated:4, mg400[-lenient]:ADDRESS[:DASHBOARD_PORT], magician:PORT, ros2:twist, ros2:pose, ur:ADDRESS",
-    ),
-]
+ARMS = "simulated, simulated:4, mg400[-lenient]:ADDRESS[:DASHBOARD_PORT], magician:PORT, ros2:twist, ros2:pose, ur:ADDRESS"
+ArmOption = Annotated[str, Option("--arm", metavar="A", help=ARMS)]
 DryRun = Annotated[bool, Option("--dry-run", help="check and print the plan, without motion")]
 Limits = Annotated[str | None, Option("--safety", help="limits: mg400, magician, ros2, ur, or a TOML file"), Formerly("limits")]
-Ros2 = Annotated[
-    str | None, Option("--ros2", metavar="NAME", help="publish frames, pins and estimates as ROS 2 topics /NAME/..., such as tactip")
-]
-AtRest = Annotated[
-    str,
-    Option(
-        "--at-rest",
-        metavar="FRAME|first|none",
-        help="frame without contact, the zero of displacements: a file, the first frame (an error if it shows a contact), "
-        "or none (positions at rest of the model, or estimated from some forty contacts)",
-    ),
-]
+TOPICS = "publish frames, pins and estimates as ROS 2 topics /NAME/..., such as tactip"
+Ros2 = Annotated[str | None, Option("--ros2", metavar="NAME", help=TOPICS)]
+ZERO = (
+    "frame without contact, the zero of displacements: a file, the first frame (an error if it shows a contact), "
+    "or none (positions at rest of the model, or estimated from some forty contacts)"
+)
+AtRest = Annotated[str, Option("--at-rest", metavar="FRAME|first|none", help=ZERO)]
 
 
 @app.command("live")
@@ -329,9 +314,8 @@ def grasp(
 
 emulate = group("emulate", "Emulate a device on this machine.\n\nIt prints 'ready ...' when it listens, and runs until SIGTERM or Ctrl-C.")
 
-FaultOption = Annotated[
-    list[str] | None, Option("--fault", metavar="NAME[=VALUE]", help="switch a fault on; '--fault help' lists them; may be repeated")
-]
+FAULT = "switch a fault on; '--fault help' lists them; may be repeated"
+FaultOption = Annotated[list[str] | None, Option("--fault", metavar="NAME[=VALUE]", help=FAULT)]
 TimeScale = Annotated[float, Option("--time-scale", help="speed relative to the real arm", min=1e-3)]
 
 

@@ -95,22 +95,18 @@ class Lines:
         self._line = f"{stage}:{far or ' begun'}{f', {note}' if note else ''}"
         self._print_if_due()
 
-    def _print_if_due(self) -> float:
-        """Print how far the work is if the last line is old and of another part; the seconds until the next line is due."""
+    def _print_if_due(self) -> None:
+        """Print how far the work is if the last line is old and of another part."""
         with self._turn:
-            passed_s = self._clock() - self._last_s
-            if passed_s >= self._every_s:
-                self._last_s += passed_s
-                passed_s = 0.0
+            if (now_s := self._clock()) - self._last_s >= self._every_s:
+                self._last_s = now_s
                 if self._part != self._told:
                     self._told = self._part
                     print(self._line, file=self._out, flush=True)
-            return self._every_s - passed_s
 
     def _watch(self) -> None:
-        due_s = self._every_s
-        while not self._over.wait(due_s):
-            due_s = self._print_if_due()
+        while not self._over.wait(self._every_s / 10):
+            self._print_if_due()
 
     def __enter__(self) -> "Lines":
         self._watcher = threading.Thread(target=self._watch, daemon=True)

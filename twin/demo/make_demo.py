@@ -22,11 +22,10 @@ from twin.one_contact import look_at
 from twin.pins.graph import make_graph
 from twin.pins.labelling.reference import nominal_reference
 from twin.progress import Progress, Step, report_each, silent, stage, unheard
-from twin.report import plots
+from twin.report import charts
 from twin.report.charts import new_figure, write_chart
-from twin.report.page import Page, PagePicture, code, sentence
+from twin.report.page import Column, Page, PagePicture, code, force_interval, number, sentence
 from twin.report.skin3d import draw_contact_skin
-from twin.report.table import Column, force_interval, number
 from twin.simulator import RenderedFrame, Simulator
 from twin.store import writes
 from twin.types import ContactState, Form, ImageArray, ReadableResult
@@ -69,7 +68,7 @@ class ContactResult:
     pose: ContactPose
     state: ContactState
     raw: RenderedFrame
-    look: plots.ObservedFrame
+    look: charts.ObservedFrame
     seconds: dict[str, float]
 
 
@@ -194,13 +193,13 @@ def run_demo(out: Path, *, progress: Progress = silent) -> Demo:
     return Demo(tables, [written, *sorted(pictures.iterdir())])
 
 
-def motion_figure(motions: list[tuple[str, plots.ObservedFrame]]) -> Figure:
+def motion_figure(motions: list[tuple[str, charts.ObservedFrame]]) -> Figure:
     """Displacement (top) and area change (bottom) for each motion, as in the paper's figure 1(d)."""
     figure, axes = new_figure(len(motions), 2, panel_inch=4.2)
     for column, (title, look) in enumerate(motions):
         graph, rest = look.graphs()
-        plots.draw_displacement(axes[column], rest.nodes_px, graph.nodes_px, title)
-        plots.draw_area_change(axes[column + len(motions)], graph, rest.area_px2, "")
+        charts.draw_displacement(axes[column], rest.nodes_px, graph.nodes_px, title)
+        charts.draw_area_change(axes[column + len(motions)], graph, rest.area_px2, "")
     return figure
 
 
@@ -210,7 +209,7 @@ def contact_figures(result: ContactResult) -> list[tuple[str, str]]:
     observation = look.observation
     ends = force_interval(force.tolist(), spec.skin.stiffness_factor)
     contact_mm = touched.mean(axis=0) if len(touched) else np.array([0, 0, spec.skin.apex_mm])
-    grown = plots.area_change_at(look, project_in_form(spec, look.frame.form, contact_mm[None])[0], count=12)
+    grown = charts.area_change_at(look, project_in_form(spec, look.frame.form, contact_mm[None])[0], count=12)
     parts = ", ".join(number(float(part), decimals=2, signed=True) for part in force)
     return [
         ("pins found", f"{observation.found} of {len(observation.pins_px)}"),
@@ -254,14 +253,14 @@ def add_contact(page: Page, result: ContactResult, skin: Path) -> None:
 
     def graph_figure() -> Figure:
         figure, (ax,) = new_figure(1, panel_inch=6)
-        plots.draw_frame(ax, look.frame.image, around_px=rest.nodes_px)
-        plots.draw_graph(ax, graph)
-        plots.draw_pins(ax, look.observation)
+        charts.draw_frame(ax, look.frame.image, around_px=rest.nodes_px)
+        charts.draw_graph(ax, graph)
+        charts.draw_pins(ax, look.observation)
         return figure
 
     def areas_figure() -> Figure:
         figure, (ax,) = new_figure(1, panel_inch=6)
-        plots.draw_area_change(ax, graph, rest.area_px2, "")
+        charts.draw_area_change(ax, graph, rest.area_px2, "")
         return figure
 
     page.section(title, f"{spec.description}. {result.obj.description}, pressed in by {result.pose.indent_mm:g} mm.")
@@ -277,7 +276,7 @@ def add_contact(page: Page, result: ContactResult, skin: Path) -> None:
     surfaces = "Cell area interpolated over the image: no contact, contact, difference."
     pins = chart("graph", graph_figure, "pins and Voronoi graph", found)
     page.figures(pins, chart("areas", areas_figure, "Voronoi area change", change), layout="row")
-    page.figures(chart("surfaces", lambda: plots.area_surface_figure(rest, graph), "interpolated area surfaces", surfaces))
+    page.figures(chart("surfaces", lambda: charts.area_surface_figure(rest, graph), "interpolated area surfaces", surfaces))
     rows = [{"name": name, "value": value} for name, value in contact_figures(result)]
     page.table(rows, [Column("name", "figure"), Column("value", "value")])
 

@@ -17,8 +17,7 @@ from twin.pins.detectors.legacy import LegacyPipeline
 from twin.pins.graph import GraphKind, make_graph
 from twin.pins.labelling.reference import Reference, nominal_reference, spread_out
 from twin.pins.pipeline import Pipeline
-from twin.report.charts import new_figure, save_figure
-from twin.report.plots import area_surface_figure, draw_frame, draw_graph, draw_nodes
+from twin.report.charts import area_surface_figure, draw_frame, draw_graph, draw_nodes, new_figure, save_figure
 from twin.store import write_npz, writes
 from twin.types import Form, PinGraph, ReadableResult
 

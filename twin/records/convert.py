@@ -1,7 +1,7 @@
 """Translates records from any format into any other, and keeps a record in further formats while it is being made."""
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -25,15 +25,10 @@ from twin.records.session import is_session, rig_records, session_records
 from twin.store import writes
 from twin.types import Frame, ReadableResult
 
-READERS: dict[str, Callable[[Path], Records]] = {
-    RecordingWriter.FORMAT: recording_records,
-    LeRobotWriter.FORMAT: lerobot_records,
-    HuggingFaceWriter.FORMAT: huggingface_records,
-    Ros2Writer.FORMAT: ros2_records,
-}
-"""Function that reads the records of each format."""
 WRITERS: dict[str, type[FolderWriter]] = {each.FORMAT: each for each in (RecordingWriter, LeRobotWriter, HuggingFaceWriter, Ros2Writer)}
 """Class that writes each format."""
+READERS = dict(zip(WRITERS, (recording_records, lerobot_records, huggingface_records, ros2_records), strict=True))
+"""Function that reads the records of each format."""
 FORMATS = tuple(READERS)
 """Formats that can be written."""
 ALSO = tuple(name for name in FORMATS if name != RecordingWriter.FORMAT)
@@ -246,7 +241,7 @@ def _missing(opened: Sequence[Records], writer: FolderWriter, done: Callable[[in
         done(number)
 
 
-class KeptAlso(AbstractContextManager["KeptAlso"]):
+class KeptAlso(ExitStack):
     """Keeps a growing record in further formats, each in its own subfolder. A context manager.
 
     The record itself is always complete. If the process is killed, the missing episodes of the other formats are written when the same
@@ -269,6 +264,7 @@ class KeptAlso(AbstractContextManager["KeptAlso"]):
     """
 
     def __init__(self, folder: Path, formats: Sequence[str], sensor: SensorSpec, *, at_once: bool = True) -> None:
+        super().__init__()
         self.folder, self.formats, self.sensor, self.at_once = folder, tuple(dict.fromkeys(formats)), sensor, at_once
         for name in self.formats:
             if name not in ALSO:
@@ -276,10 +272,6 @@ class KeptAlso(AbstractContextManager["KeptAlso"]):
             for needed in WRITERS[name].LIBRARIES:
                 library(needed)
         self._writers: list[FolderWriter] = []
-        self._open = ExitStack()
-
-    def __exit__(self, *_: object) -> None:
-        self._open.close()
 
     def catch_up(self) -> None:
         """Write the episodes of the record that the other formats do not have.
@@ -296,7 +288,7 @@ class KeptAlso(AbstractContextManager["KeptAlso"]):
             rate_hz = records.rate_hz()
             for name in self.formats:
                 writer = open_writer(self.folder / name, name, records.about, rate_hz, at_once=self.at_once)
-                self._writers.append(self._open.enter_context(writer))
+                self._writers.append(self.enter_context(writer))
         for writer in self._writers:
             writer.write(_missing([records], writer, lambda done: None))
             for note in writer.notes():

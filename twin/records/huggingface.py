@@ -19,8 +19,8 @@ from twin.frames.images import read_image, write_image
 from twin.frames.tables import base_name
 from twin.records.folder import PicturesWriter, card, read_facts, reading_tables, records_in, require_numbered, write_tables
 from twin.records.record import CHANNELS, TIME, About, Episode, Records, RecordStep
-from twin.store import remove_parts, replace_folder, write_json, write_text
-from twin.store.atomic import PART
+from twin.store import write_json, write_text
+from twin.store.atomic import PART, remove_parts, replace_folder
 
 DATA, EPISODES, METADATA, CARD = "data", "episodes", "metadata.parquet", "README.md"
 FRONT = "configs:\n- config_name: default\n  drop_labels: true\n  data_files: data/**\ntags:\n- tactile\n"

@@ -9,7 +9,7 @@ frame. In addition to LeRobot's columns, the table of episodes has ``tactip/fact
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import partial, reduce
 from itertools import chain
 from pathlib import Path
@@ -135,16 +135,18 @@ class LeRobotWriter(FolderWriter):
                 if episode.task not in self._tasks:
                     self._tasks.append(episode.task)
                 task = self._tasks.index(episode.task)
-                gathered = _Gathered(self.about)
+                gathered = _Gathered()
                 for step in episode.steps():
                     self._require_fitting(episode, step)
-                    gathered.add(step, length)
-                    row = self._row(step, length, number, frames + length, task)
-                    for film, image in zip(opened, step.images, strict=False):
-                        film.write(np.ascontiguousarray(_colour(image)[..., ::-1]))
-                    rows.append(row)
-                    pictures = [row[image] for image in self._images if image in row]
-                    written += sum(len(each["bytes"]) for each in pictures) or 4 * sum(self.about.numbers.values())
+                    row = self._numbers(step, length, number, frames + length, task)
+                    pictures = dict(zip(self._images, map(_colour, step.images), strict=True))
+                    gathered.add(row, pictures)
+                    for film, image in zip(opened, pictures.values(), strict=False):
+                        film.write(np.ascontiguousarray(image[..., ::-1]))
+                    stored = {} if self.video else {column: png(image) for column, image in pictures.items()}
+                    written += sum(map(len, stored.values())) or 4 * sum(self.about.numbers.values())
+                    path = f"frame-{length:06d}.png"
+                    rows.append({column: {"bytes": data, "path": path} for column, data in stored.items()} | row)
                     length += 1
                     if len(rows) == ROWS:
                         table.write_table(pa.Table.from_pylist(rows, schema))
@@ -153,10 +155,8 @@ class LeRobotWriter(FolderWriter):
                     table.write_table(pa.Table.from_pylist(rows, schema))
                 if not length:
                     continue
-                self._compare_times(np.array(gathered.times_s), episode.key)
-                stats = gathered.stats(self.rate_hz, number, frames, task)
-                row = self._episode_row(episode, number, frames, length, at)
-                group.append((row, self._facts(episode, length), stats))
+                self._compare_times(np.array([row[TIME] for row in gathered.rows]), episode.key)
+                group.append((self._episode_row(episode, number, frames, length, at), self._facts(episode, length), gathered.stats()))
                 frames += length
                 if self.at_once or written >= DATA_MB * 1e6:
                     break
@@ -177,10 +177,9 @@ class LeRobotWriter(FolderWriter):
         if most_s > 0.5 / self.rate_hz:
             self._off.append((most_s, key, describe_pauses(times_s)))
 
-    def _row(self, step: RecordStep, number: int, episode: int, index: int, task: int) -> dict[str, Any]:
+    def _numbers(self, step: RecordStep, number: int, episode: int, index: int, task: int) -> dict[str, Any]:
+        """A step's row without its pictures."""
         row: dict[str, Any] = {}
-        for column, image in () if self.video else zip(self._images, step.images, strict=True):
-            row[column] = {"bytes": png(_colour(image)), "path": f"frame-{number:06d}.png"}
         for name, count in self.about.numbers.items():  # a single number is no list
             values = np.asarray(step.values[name], np.float32)
             row[channel_of(name).column] = values.tolist() if count > 1 else values.item()
@@ -219,9 +218,8 @@ class LeRobotWriter(FolderWriter):
         for name in self.about.numbers:
             shape, names = list(self.about.shape(name)), list(self.about.axes(name))
             features[channel_of(name).column] = {"dtype": "float32", "shape": shape, "names": names if len(shape) == 1 else ["pin", "axis"]}
-        features[TIME] = {"dtype": "float64", "shape": [1], "names": None}
-        features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
-        return features | {name: {"dtype": "int64", "shape": [1], "names": None} for name in COUNTERS}
+        kinds = {TIME: "float64", "timestamp": "float32"} | dict.fromkeys(COUNTERS, "int64")
+        return features | {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in kinds.items()}
 
     def _episode_row(self, episode: Episode, number: int, start: int, length: int, at: dict[str, int]) -> dict[str, Any]:
         row: dict[str, Any] = {"episode_index": number, "tasks": [episode.task], "length": length}
@@ -262,37 +260,30 @@ class LeRobotWriter(FolderWriter):
 class _Gathered:
     """Data from which an episode's statistics are computed."""
 
-    def __init__(self, about: About) -> None:
-        self._about = about
-        self.times_s: list[float] = []
-        self._values: list[Mapping[str, np.ndarray]] = []
-        self._pictures: list[list[np.ndarray]] = []  # of each kept step
+    def __init__(self) -> None:
+        self.rows: list[dict[str, Any]] = []
+        self._pictures: list[dict[str, np.ndarray]] = []  # of each kept step
         self._every = 1
 
-    def add(self, step: RecordStep, number: int) -> None:
+    def add(self, row: dict[str, Any], pictures: dict[str, np.ndarray]) -> None:
         """Add a step. Of a long episode only every second picture is kept, then every fourth, and so on."""
-        self.times_s.append(step.time_s)
-        self._values.append(step.values)
-        if number % self._every == 0:
-            self._pictures.append([_colour(image)[::PIXEL_STEP, ::PIXEL_STEP] for image in step.images])
+        if len(self.rows) % self._every == 0:
+            self._pictures.append({column: image[::PIXEL_STEP, ::PIXEL_STEP] for column, image in pictures.items()})
         if len(self._pictures) > 2 * SAMPLED:
             self._pictures, self._every = self._pictures[::2], 2 * self._every
+        self.rows.append(row)
 
-    def stats(self, rate_hz: int, number: int, start: int, task: int) -> Stats:
+    def stats(self) -> Stats:
         """Statistics of each column, in LeRobot's shapes: (3, 1, 1) for pictures, with values from 0 to 1, and (2,) for pins."""
-        length, found = len(self.times_s), {}
-        images = [image_column(view) for view in self._about.views]
-        for column, pictures in zip(images, zip(*self._pictures, strict=True), strict=True):
-            pixels = np.stack(pictures).reshape(-1, 3) / 255.0
-            found[column] = {key: value.reshape(-1, 1, 1) for key, value in _deviations(pixels).items()}
-        for name in self._about.numbers:
-            stacked = np.stack([np.asarray(values[name], np.float32) for values in self._values]).astype(float)
-            found[channel_of(name).column] = _deviations(stacked.reshape(-1, stacked.shape[-1]))
-        frames = np.arange(length)
-        counters = (frames, np.full(length, number), start + frames, np.full(length, task))
-        plain = {TIME: np.array(self.times_s), "timestamp": frames / rate_hz} | dict(zip(COUNTERS, counters, strict=True))
-        found |= {name: _deviations(np.asarray(values, float)[:, None]) for name, values in plain.items()}
-        return {name: each | {"count": np.array([len(self._pictures) if name in images else length])} for name, each in found.items()}
+        found = {}
+        for column in self._pictures[0]:
+            pixels = np.stack([pictures[column] for pictures in self._pictures]).reshape(-1, 3) / 255.0
+            shaped = {key: value.reshape(-1, 1, 1) for key, value in _deviations(pixels).items()}
+            found[column] = shaped | {"count": np.array([len(self._pictures)])}
+        for column, first in self.rows[0].items():
+            numbers = np.array([row[column] for row in self.rows], float).reshape(-1, *np.shape(first)[-1:] or (1,))
+            found[column] = _deviations(numbers) | {"count": np.array([len(self.rows)])}
+        return found
 
 
 def _deviations(rows: np.ndarray) -> dict[str, np.ndarray]:
@@ -343,19 +334,15 @@ def _steps_of(folder: Path, row: dict[str, Any], about: About) -> Iterator[Recor
     path, number = folder / DATA_PATH.format(**{key: row[f"data/{key}"] for key in ("chunk_index", "file_index")}), row["episode_index"]
     columns = [image_column(view) for view in about.views]
     films = [_film_pictures(folder, row, about, column) for column in columns if f"videos/{column}/from_timestamp" in row]
-    with reading_tables(path) as parquet:
-        file = parquet.ParquetFile(path, page_checksum_verification=True)
-        leaf = next(k for k in range(len(file.schema)) if file.schema.column(k).path == "episode_index")
-        for group in range(file.num_row_groups):
-            statistics = file.metadata.row_group(group).column(leaf).statistics
-            if statistics is not None and statistics.has_min_max and not statistics.min <= number <= statistics.max:
-                continue
-            for line in file.read_row_group(group).to_pylist():
-                if line["episode_index"] == number:
-                    images = [next(film) for film in films] or [image_of(line[each]["bytes"], about.gray, str(path)) for each in columns]
-                    found = {name: np.asarray(line[channel_of(name).column], np.float32) for name in about.numbers}
-                    values = {name: value.reshape(about.shape(name)) for name, value in found.items()}
-                    yield RecordStep(images[0], float(line[TIME]), values, tuple(images[1:]))
+    with reading_tables(path):
+        dataset = library("pyarrow.dataset")
+        checked, own = dataset.ParquetFragmentScanOptions(page_checksum_verification=True), dataset.field("episode_index") == number
+        for rows in dataset.dataset(path).to_batches(filter=own, batch_size=ROWS, fragment_scan_options=checked):
+            for line in rows.to_pylist():
+                images = [next(film) for film in films] or [image_of(line[each]["bytes"], about.gray, str(path)) for each in columns]
+                found = {name: np.asarray(line[channel_of(name).column], np.float32) for name in about.numbers}
+                values = {name: value.reshape(about.shape(name)) for name, value in found.items()}
+                yield RecordStep(images[0], float(line[TIME]), values, tuple(images[1:]))
 
 
 def _film_pictures(folder: Path, row: dict[str, Any], about: About, column: str) -> Iterator[np.ndarray]:

@@ -170,10 +170,8 @@ def transform(T_mm: np.ndarray, header: Mapping[str, Any], child: str) -> dict[s
 
 def number_array(values: np.ndarray, *labels: str) -> dict[str, Any]:
     """Numbers as an array message with named dimensions."""
-    dim = [
-        {"label": label, "size": n, "stride": int(np.prod(values.shape[k:]))}
-        for k, (label, n) in enumerate(zip(labels, values.shape, strict=False))
-    ]
+    sizes = zip(labels, values.shape, strict=False)
+    dim = [{"label": label, "size": n, "stride": int(np.prod(values.shape[k:]))} for k, (label, n) in enumerate(sizes)]
     return {"layout": {"dim": dim}, "data": values.ravel()}
 
 

@@ -10,7 +10,7 @@ import math
 import os
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -139,14 +139,11 @@ def _steps_and_note(folder: Path) -> tuple[list[dict], str]:
         text = read_regular(folder / STEPS, LARGEST_BYTES).decode("utf-8", "replace")
     steps: list[dict] = []
     lines = text.split("\n")
-    for line in lines[:-1]:
-        try:
-            step = json.loads(line)
-        except (ValueError, RecursionError):
-            break
-        if not isinstance(step, dict):
-            break
-        steps.append(step)
+    with suppress(ValueError, RecursionError):
+        for line in lines[:-1]:
+            if not isinstance(step := json.loads(line), dict):
+                break
+            steps.append(step)
     whole = len(steps) == len(lines) - 1 and not lines[-1]
     return steps, "" if whole else f"{STEPS}: line {len(steps) + 1} is cut or damaged; the lines before it are read"
 

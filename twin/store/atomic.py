@@ -120,6 +120,19 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray], *, compressed: bool 
     return write_with(path, lambda file: save(file, **arrays))
 
 
+def make_folder(folder: Path) -> Path:
+    """The folder, which is made if it does not exist.
+
+    Raises
+    ------
+    StoreError
+        It can't be made.
+    """
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
 def replace_folder(part: Path, path: Path) -> Path:
     """Rename a finished folder, which replaces an existing folder of that name. Returns the path.
 

@@ -16,8 +16,7 @@ import platformdirs
 
 from twin.errors import StoreError, warn_once
 from twin.store.atomic import write_npz
-from twin.store.fingerprint import Maker, UnknownCodeError, fingerprint
-from twin.store.made import inputs_digest
+from twin.store.fingerprint import Maker, UnknownCodeError, fingerprint, inputs_digest
 
 _VARIABLE = "TACTIP_CACHE"
 _FORMAT = 2  # version of the files' format; it is increased if older files must not be read

@@ -5,19 +5,26 @@ the module that defines it, so the package's other modules don't count. The fing
 strings that stand alone, which are docstrings and explanations of constants, and without what a raised error says, because a computation
 that raises has no result. Comments and formatting are not in the tree. Therefore a changed formula changes the fingerprint, and a changed
 explanation or error does not. The texts of the command line are in ``twin.cli``, which no computing module imports.
+
+``made_by`` is the record that every output has of this code, with the digest of its inputs.
 """
 
 import ast
 import gc
 import hashlib
 import inspect
+import json
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
+from datetime import UTC, datetime
 from functools import cache, cached_property, partial
 from importlib import metadata
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
 
 from twin.errors import StoreError
 
@@ -102,18 +109,14 @@ def code_of(*makers: Maker, root: Path = ROOT) -> CodeOf:
     UnknownCodeError
         The source of one of them can't be read.
     """
-    return _code(root, tuple(sorted({_module_of(maker) for maker in makers})))
+    own = map(_unwrap, makers)
+    return _code(root, tuple(sorted({maker if isinstance(maker, str) else maker.__module__ for maker in own})))
 
 
 def name_of(maker: Maker) -> str:
     """Name of a function or class with its module, or name of a module."""
     maker = _unwrap(maker)
     return maker if isinstance(maker, str) else f"{maker.__module__}.{maker.__qualname__}"
-
-
-def _module_of(maker: Maker) -> str:
-    maker = _unwrap(maker)
-    return maker if isinstance(maker, str) else maker.__module__
 
 
 def _unwrap(maker: Maker) -> Maker:
@@ -250,8 +253,73 @@ def _is_text(part: object) -> bool:
 
 
 @cache
-def _version(distribution: str) -> str:
+def _version(distribution: str, otherwise: str = "of another origin") -> str:
     try:
         return metadata.version(distribution)
     except metadata.PackageNotFoundError:
-        return "of another origin"
+        return otherwise
+
+
+PROGRAM = "tactip-twin"
+"""Name under which this program is installed."""
+
+
+def inputs_digest(*inputs: object) -> str:
+    """Digest of inputs, 64 hexadecimal digits. It does not depend on the order of a dict's keys.
+
+    Parameters
+    ----------
+    inputs : objects
+        Values that JSON can hold, bytes, arrays of numbers, specifications, dataclasses and paths, nested to any depth.
+
+    Raises
+    ------
+    TypeError
+        An input has another type.
+    """
+    return hashlib.sha256(json.dumps(inputs, sort_keys=True, default=_plain).encode()).hexdigest()
+
+
+def _plain(value: object) -> object:
+    """A value that JSON can represent, in place of one that it can't."""
+    if isinstance(value, bytes):
+        return {"sha256": hashlib.sha256(value).hexdigest()}
+    if isinstance(value, np.ndarray) and not value.dtype.hasobject:
+        return {"array": [value.dtype.str, list(value.shape), hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()]}
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    if isinstance(value, PurePath):
+        return str(value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return {field.name: getattr(value, field.name) for field in fields(value)}
+    raise TypeError(f"a key holds JSON and bytes, arrays of numbers, specifications and dataclasses, not {type(value).__name__}")
+
+
+def made_by(*by: Maker, inputs: object = None, dated: bool = True) -> dict[str, str]:
+    """The record of a result.
+
+    Parameters
+    ----------
+    by : functions, classes or names of modules
+        The code that made the result; the record has the name of the first one.
+    inputs : object, optional
+        The inputs of the result, as ``inputs_digest`` takes them.
+    dated : bool
+        Whether the record has a date. It must be False if the same work must give the same bytes.
+
+    Returns
+    -------
+    dict of str to str
+        ``by`` (name), ``version`` (of the program), ``code`` (fingerprint), ``inputs`` (digest, if there are any) and ``date`` (UTC).
+    """
+    record = {"by": name_of(by[0]), "version": program_version(), "code": fingerprint(*by)}
+    if inputs is not None:
+        record["inputs"] = inputs_digest(inputs)
+    return record | ({"date": datetime.now(UTC).isoformat(timespec="seconds")} if dated else {})
+
+
+def program_version() -> str:
+    """Version of this program, or "not installed"."""
+    return _version(PROGRAM, "not installed")

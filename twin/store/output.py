@@ -25,7 +25,7 @@ import platformdirs
 
 from twin.errors import StoreError
 from twin.store.atomic import LOCK, PART, lock_folder, unwritten, write_json
-from twin.store.made import PROGRAM
+from twin.store.fingerprint import PROGRAM
 
 WRITTEN = ".written.json"
 """Name of the list of files that this program wrote into a folder."""
@@ -151,11 +151,8 @@ def contents(folder: Path) -> list[str]:
         If the folder can't be read.
     """
     try:
-        return sorted(
-            path.name
-            for path in folder.iterdir()
-            if path.name not in (LOCK, WRITTEN) and not (path.name.startswith(".") and path.name.endswith(PART))
-        )
+        names = [path.name for path in folder.iterdir() if path.name not in (LOCK, WRITTEN)]
+        return sorted(name for name in names if not (name.startswith(".") and name.endswith(PART)))
     except FileNotFoundError:
         return []
     except OSError as error:

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 
 from twin.errors import StoreError
-from twin.store.atomic import write_json, write_npz, writing
-from twin.store.fingerprint import Maker, code_of, fingerprint
-from twin.store.made import inputs_digest, made_by
+from twin.store.atomic import make_folder, write_json, write_npz
+from twin.store.fingerprint import Maker, code_of, fingerprint, inputs_digest, made_by
 
 MADE_BY = "made_by.json"  # file with the record of the code, in the folder of a whole
 _RECORD = "made_by"  # key of the record in the file of an item
@@ -76,7 +75,7 @@ def keep_arrays(folder: Path, item: Item, arrays: dict[str, np.ndarray]) -> Path
     StoreError
         The file can't be written.
     """
-    return write_npz(_ready(folder) / f"{item.file}.npz", arrays | {_RECORD: np.array(json.dumps(item.made_by))})
+    return write_npz(make_folder(folder) / f"{item.file}.npz", arrays | {_RECORD: np.array(json.dumps(item.made_by))})
 
 
 def kept_arrays(folder: Path, item: Item, compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -102,7 +101,7 @@ def keep_json(folder: Path, item: Item, content: object) -> Path:
     StoreError
         The file can't be written.
     """
-    return write_json(_ready(folder) / f"{item.file}.json", {_RECORD: item.made_by, _CONTENT: content})
+    return write_json(make_folder(folder) / f"{item.file}.json", {_RECORD: item.made_by, _CONTENT: content})
 
 
 def kept_json(folder: Path, item: Item, compute: Callable[[], Any]) -> Any:
@@ -145,10 +144,3 @@ def require_same_code(folder: Path, *by: Maker, begun: bool) -> None:
     if changes:
         more = f" and {len(changes) - _MOST_CHANGES} more" if len(changes) > _MOST_CHANGES else ""
         raise StoreError(f"{folder}: made by another version of the program ({', '.join(changes[:_MOST_CHANGES])}{more}); {remedy}")
-
-
-def _ready(folder: Path) -> Path:
-    """The folder, made if missing."""
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    return folder

@@ -68,6 +68,10 @@ class SolvedMesh(StrEnum):
     FINE = "fine mesh"
 
 
+Lit = tuple[FloatArray, Light]
+"""Linear light of the dome's part of the frame, and how it was made."""
+
+
 @dataclass(frozen=True)
 class ContactAnswer:
     """Everything that the page shows of one pose.
@@ -305,7 +309,7 @@ class MovingContact:
         self._solved += 1
         solved_ms = 1e3 * (time.perf_counter() - started)
         arrived = bool(np.abs(T - goal).max() < SAME_MM)
-        return self._answer(T, state, SolvedMesh.USUAL, arrived=arrived, stopped=reason if arrived else "", ms={"contact": solved_ms})
+        return self._answer(T, state, SolvedMesh.USUAL, None, arrived, reason if arrived else "", {"contact": solved_ms})
 
     def newest_traced(self, solved: int, light: FloatArray, lit: Light, traced_ms: float) -> ContactAnswer | None:
         """The newest answer with path-traced light (h, w) or (h, w, 3) of a contact; None if a newer contact was solved since."""
@@ -343,7 +347,7 @@ class MovingContact:
         self._refined = True
         self._solved += 1
         last, ms = self._last, 1e3 * (time.perf_counter() - started)
-        return self._answer(self._T, state, SolvedMesh.FINE, arrived=last.arrived, stopped=last.stopped, ms={"contact": ms})
+        return self._answer(self._T, state, SolvedMesh.FINE, None, last.arrived, last.stopped, {"contact": ms})
 
     @property
     def refined(self) -> bool:
@@ -357,8 +361,7 @@ class MovingContact:
         if last is None:
             return None
         traced = None if last.lit is Light.RASTERISED else (last.light, last.lit)
-        T = last.pose.matrix(self._apex_mm)
-        return self._answer(T, last.state, last.mesh, traced, arrived=last.arrived, stopped=last.stopped, ms=last.ms)
+        return self._answer(last.pose.matrix(self._apex_mm), last.state, last.mesh, traced, last.arrived, last.stopped, last.ms)
 
     def _store_path(self, T: FloatArray) -> None:
         """Store the path for the fine mesh. A contact's path begins at the last free pose, or where the contact was started again."""
@@ -374,19 +377,12 @@ class MovingContact:
         self._T, self.pose = T, ObjectPose.of(T, self._apex_mm)
 
     def _answer(
-        self,
-        T: FloatArray,
-        state: ContactState,
-        mesh: SolvedMesh,
-        traced: tuple[FloatArray, Light] | None = None,
-        *,
-        arrived: bool,
-        stopped: str,
-        ms: dict[str, float],
+        self, T: FloatArray, state: ContactState, mesh: SolvedMesh, given: Lit | None, arrived: bool, stopped: str, ms: dict[str, float]
     ) -> ContactAnswer:
+        """The answer for a pose and state, with the given light or with rasterised one."""
         self._count += 1
         started = time.perf_counter()
-        light, lit = traced or (self.camera.draw(state), Light.RASTERISED)
+        light, lit = given or (self.camera.draw(state), Light.RASTERISED)
         raw = self.camera.raw(light, seed=self._count)
         drawn = time.perf_counter()
         frame, estimate, seen = self.observe(raw, self.setup.form, self._pipeline)

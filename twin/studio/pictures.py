@@ -1,16 +1,21 @@
-"""Makes the pictures and numbers of the page, without a browser."""
+"""Makes the pictures, videos and numbers of the page, without a browser."""
 
 import re
+import time
 from collections.abc import Callable, Mapping
 from enum import StrEnum
 from html import escape
 from importlib.resources import files
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
 
+from twin.errors import TwinError
 from twin.estimate import Estimate, readable_labels
 from twin.pins.batch import FOUND_RGB, FULL_CHANGE, GRAY, area_colours, draw_overlay, voronoi_map
+from twin.store import write_bytes
 from twin.types import FloatArray, Frame, ImageArray, Observation
 
 ARROW_RGB = (255, 140, 40)
@@ -84,8 +89,7 @@ def estimate_table(estimate: Estimate | None, truth: Mapping[str, float], *, mis
         named = label if label == name else f"{label} ({name})"  # its sign and zero are those of the recordings' column
         cells = f"<td>{escape(', '.join(filter(None, (named, unit))))}</td><td>{value:+.2f}</td><td>{low:+.2f} to {high:+.2f}</td>"
         rows.append(f"<tr>{cells}<td class='{kind}'>{true}</td></tr>")
-    head = "<tr><th>estimate</th><th>value</th><th>90 % interval</th><th>truth</th></tr>"
-    return f"<table>{head}{''.join(rows)}</table>"
+    return f"<table><tr><th>estimate</th><th>value</th><th>90 % interval</th><th>truth</th></tr>{''.join(rows)}</table>"
 
 
 def number_table(rows: Mapping[str, str]) -> str:
@@ -113,3 +117,75 @@ def paragraph(text: str, kind: str) -> str:
     """HTML of a line; empty for an empty text. Arguments that the text names in backquotes become the names of the page's controls."""
     named = re.sub(r"`(\w+)`", lambda found: f"'{CONTROLS.get(found[1], found[1])}'", text)
     return f"<p class='{kind}'>{escape(named)}</p>" if text else ""
+
+
+RATE_HZ = 15.0
+"""Pictures per second of a video."""
+LONGEST_S = 300.0
+"""Time, s, after which a video ends by itself."""
+
+
+class FilmWriter:
+    """Writes pictures as an MP4, each for the time for which it was shown. The file appears when it is complete.
+
+    Parameters
+    ----------
+    path : Path
+        A new file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._folder = TemporaryDirectory(prefix="tactip-video-")
+        self._part = Path(self._folder.name) / "part.mp4"
+        self._writer: cv2.VideoWriter | None = None
+        self._size_px = (0, 0)
+        self._begun_s, self._count = time.monotonic(), 0
+        self._last: ImageArray | None = None
+
+    def add(self, picture: ImageArray, *, at_s: float | None = None) -> None:
+        """Show a picture (h, w, 3) RGB from now on, or from ``at_s``, s after the beginning.
+
+        Raises
+        ------
+        TwinError
+            OpenCV can't write MP4 files on this machine.
+        """
+        at_s = time.monotonic() - self._begun_s if at_s is None else at_s
+        if at_s > LONGEST_S:
+            return
+        if self._writer is None:
+            self._size_px = picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2
+            self._writer = cv2.VideoWriter(str(self._part), cv2.VideoWriter.fourcc(*"mp4v"), RATE_HZ, self._size_px)
+            if not self._writer.isOpened():
+                raise TwinError(f"{self._path}: OpenCV can't write an MP4 here; save pictures instead")
+            self._last = picture
+        while self._last is not None and self._count < at_s * RATE_HZ:
+            self._write(self._last)
+        self._last = picture
+
+    def _write(self, picture: ImageArray) -> None:
+        assert self._writer is not None
+        width, height = self._size_px
+        canvas = np.zeros((height, width, 3), np.uint8)
+        part = picture[:height, :width, ::-1]
+        canvas[: part.shape[0], : part.shape[1]] = part
+        self._writer.write(canvas)
+        self._count += 1
+
+    def close(self) -> str:
+        """End the video, and return a line that states what was written.
+
+        Raises
+        ------
+        StoreError
+            The file can't be written.
+        """
+        if self._writer is None or self._last is None:
+            self._folder.cleanup()
+            return "no video: no picture was shown"
+        self._write(self._last)
+        self._writer.release()
+        write_bytes(self._path, self._part.read_bytes())
+        self._folder.cleanup()
+        return f"saved {self._path} ({self._count / RATE_HZ:.1f} s)"

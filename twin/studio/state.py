@@ -16,7 +16,8 @@ from scenes import load_object, load_sensor
 from scenes.base import NonNegative, Section, SpecError, problem_text
 from scenes.files import read_regular
 from twin.errors import ErrorsAs, TwinError, format_count
-from twin.store import text_file, write_json, writing
+from twin.store import text_file, write_json
+from twin.store.atomic import make_folder
 from twin.studio.pictures import OverlayChoices
 from twin.studio.pose import NAMES, ObjectPose
 from twin.studio.scene import PinColour
@@ -197,19 +198,6 @@ def tap_and_shear(pose: ObjectPose) -> Way:
     times_s = np.linspace(0.0, 8.0, 81)
     moves = zip(times_s.tolist(), *(np.interp(times_s, knots_s, values).tolist() for values in (depths_mm, shears_mm)), strict=True)
     return [(at_s, replace(pose, x_mm=shear, y_mm=0.0, depth_mm=depth)) for at_s, depth, shear in moves]
-
-
-def make_folder(folder: Path) -> Path:
-    """The folder, which is made if it does not exist.
-
-    Raises
-    ------
-    TwinError
-        It can't be made.
-    """
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    return folder
 
 
 def next_path(folder: Path, stem: str, suffix: str) -> Path:

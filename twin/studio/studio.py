@@ -5,6 +5,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 from twin.studio.modes.degrade_mode import DegradeMode
 from twin.studio.modes.mode import PageMode
@@ -66,8 +67,8 @@ class StudioPlan:
 ModeMaker = Callable[[StudioPage, TwinMode, StudioPlan], PageMode]
 
 
-class Studio:
-    """The page with its modes. A context manager.
+class Studio(ExitStack):
+    """The page with its modes. A context manager, which closes all at its end, even if one fails, so that an arm is always released.
 
     Parameters
     ----------
@@ -79,6 +80,7 @@ class Studio:
     """
 
     def __init__(self, plan: StudioPlan, model_of: ModelOf, live_mode: ModeMaker) -> None:
+        super().__init__()
         titles = [TwinMode.title, DegradeMode.title, RecordingMode.title, LIVE, NewMode.title]
         self.page = StudioPage(heading(plan.state), host=plan.host, port=plan.port, modes=titles, saves=plan.out)
         self.twin = TwinMode(self.page, plan.state, plan.out, model_of, traces=plan.traces)
@@ -89,16 +91,12 @@ class Studio:
         self.modes: list[PageMode] = [self.twin, degrade, recording, live, new]
         self.page.set_modes(self.modes)
 
-    def __enter__(self) -> "Studio":
-        self._open = ExitStack()
-        self._open.enter_context(self.page)
+    def __enter__(self) -> Self:
+        self.enter_context(self.page)
         for mode in self.modes:
-            self._open.callback(mode.stop)
+            self.callback(mode.stop)
             mode.start()
         return self
-
-    def __exit__(self, *error: object) -> None:
-        self._open.close()  # closes all, even if one fails, so that an arm is always released
 
 
 def run_studio(plan: StudioPlan, model_of: ModelOf, live_mode: ModeMaker, *, on_open: Callable[[str], None] = lambda url: None) -> None:

@@ -98,7 +98,7 @@ def commands():
 
 def studio():
     import twin
-    from twin.studio.tracing import Failed, Tracer
+    from twin.studio.worker import Failed, Tracer
 
     found = threading.Event()
     with closing(Tracer(twin.load_sensor("mg400-127"))) as tracer:

@@ -30,9 +30,7 @@ from twin.estimate import readable_labels
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.progress import Progress, Step, silent, stage, unheard
 from twin.report.charts import muted_colour, plain_log, sized_figure, write_chart
-from twin.report.page import Page, PagePicture
-from twin.report.table import Column, number, write_table
-from twin.report.themes import BLUE, OLIVE, PURPLE, RED
+from twin.report.page import BLUE, OLIVE, PURPLE, RED, Column, Page, PagePicture, number, write_table
 from twin.rig.labels import ArmLabel
 from twin.store import writes
 from twin.types import ReadableResult

@@ -32,11 +32,8 @@ from twin.objects import build_field
 from twin.pins import Pipeline, make_graph
 from twin.pins.graph import GraphKind
 from twin.progress import Progress, Step, silent, stage, unheard
-from twin.report.charts import new_figure, plain_log, sized_figure, write_chart
-from twin.report.page import Page, PagePicture
-from twin.report.plots import draw_area_change
-from twin.report.table import Column, number, write_table
-from twin.report.themes import SERIES
+from twin.report.charts import draw_area_change, new_figure, plain_log, sized_figure, write_chart
+from twin.report.page import SERIES, Column, Page, PagePicture, number, write_table
 from twin.simulator import Simulator
 from twin.store import writes
 from twin.types import Form, PinGraph, ReadableResult

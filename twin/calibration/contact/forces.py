@@ -37,8 +37,7 @@ from twin.geometry.solid import Resolution
 from twin.mechanics.solver import SkinSolver
 from twin.progress import Progress, Step, stage, unheard
 from twin.report.charts import new_figure, write_chart
-from twin.report.page import Page, PagePicture
-from twin.report.table import Column, write_rows
+from twin.report.page import Column, Page, PagePicture, write_rows
 from twin.rig.contact import RigContact
 from twin.rig.kinematics import rig_of
 from twin.rig.labels import ArmLabel, poses_and_moves

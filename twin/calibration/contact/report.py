@@ -11,10 +11,8 @@ from matplotlib.figure import Figure
 from twin.calibration.contact.fit import DETERMINED, INDEPENDENT, Z90, CalibrationSetup, ContactFit, FittedParameter
 from twin.evaluation.labelled.model import MeasuredFrames
 from twin.frames import distinct_stems
-from twin.report.charts import new_figure, write_chart
-from twin.report.page import Page, PagePicture
-from twin.report.plots import draw_displacement, enlargement
-from twin.report.table import Cell, Column, number
+from twin.report.charts import draw_displacement, enlargement, new_figure, write_chart
+from twin.report.page import Cell, Column, Page, PagePicture, number
 from twin.rig.kinematics import rig_of
 from twin.store import made_by, write_json
 

@@ -12,10 +12,8 @@ from twin.evaluation.degradation.envelope import NEAR, SHORT, Curve, Envelope, S
 from twin.evaluation.degradation.sweep import MEASURES, POSE_MEASURES, SweepSettings, cells_of
 from twin.pins import DetectorSpec
 from twin.report.charts import faint, muted_colour, sized_figure, write_chart
-from twin.report.page import Page, PagePicture, bad, good, link_to, sentence, strong
-from twin.report.table import Cell as Shown
-from twin.report.table import Column, write_rows
-from twin.report.themes import BLUE, RED, SERIES
+from twin.report.page import BLUE, RED, SERIES, Column, Page, PagePicture, bad, good, link_to, sentence, strong, write_rows
+from twin.report.page import Cell as Shown
 from twin.store import made_by, write_json
 
 ACROSS = 3

@@ -7,10 +7,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from twin.evaluation.labelled.model import MEASURES, Comparison, table_of
-from twin.report.charts import new_figure, write_chart
-from twin.report.page import Page, PagePicture
-from twin.report.plots import draw_displacement, enlargement
-from twin.report.table import Column, number, write_table
+from twin.report.charts import draw_displacement, enlargement, new_figure, write_chart
+from twin.report.page import Column, Page, PagePicture, number, write_table
 from twin.store import made_by, write_json
 
 

@@ -12,8 +12,7 @@ from twin.evaluation.pictures.statistics import RADIAL_MEASURES, TARGET, TARGET_
 from twin.frames import distinct_stems
 from twin.frames.images import write_image
 from twin.report.charts import sized_figure, write_chart
-from twin.report.page import Page, PagePicture
-from twin.report.table import Cell, Column, number, write_rows
+from twin.report.page import Cell, Column, Page, PagePicture, number, write_rows
 from twin.store import made_by, write_json
 
 NAMES = {

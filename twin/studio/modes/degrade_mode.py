@@ -1,12 +1,10 @@
 """The mode 'Degrade': the contact of the mode 'Twin', seen by a degraded sensor."""
 
 import time
-from dataclasses import dataclass
 
 import numpy as np
 
 from twin.errors import TwinError
-from twin.estimate import Estimate
 from twin.evaluation.degradation.condition import DegradedCase
 from twin.evaluation.degradation.conditions import CONDITIONS, condition
 from twin.evaluation.degradation.shots import DegradedFrame, degraded_state
@@ -15,13 +13,12 @@ from twin.optics.preview import Shading
 from twin.pins import make_detector, nominal_reference, shipped_detector
 from twin.pins.pipeline import Pipeline
 from twin.studio.contact import ContactAnswer
-from twin.studio.live_page import frame_pictures
 from twin.studio.modes.mode import PageMode
 from twin.studio.modes.twin_mode import TwinMode
-from twin.studio.page import StudioPage, put
+from twin.studio.page import StudioPage, frame_pictures, put
 from twin.studio.pictures import badge, estimate_table, paragraph
 from twin.studio.pose import ObjectPose
-from twin.types import Form, Observation
+from twin.types import Form
 
 SLIDERS = 3
 """Number of conditions that can act at once, each with its own severity."""
@@ -29,28 +26,6 @@ NO_CONDITION = "nothing"
 """Name of the choice for a slider without a condition."""
 FIRST = ("defocus", "caps-missing", "camera-rolled")
 """Conditions that are selected at first, if they exist."""
-
-
-@dataclass(frozen=True)
-class EvaluatedFrame:
-    """A degraded frame, and the results of pipeline and model for it.
-
-    Attributes
-    ----------
-    degraded : DegradedShot
-    seen : Observation
-    figures : dict of str to float
-        Values by the names of ``MEASURES``.
-    failed : tuple of str
-        Titles of the measures beyond their limits.
-    estimate : Estimate or None
-    """
-
-    degraded: DegradedFrame
-    seen: Observation
-    figures: dict[str, float]
-    failed: tuple[str, ...]
-    estimate: Estimate | None
 
 
 class FrameEvaluator:
@@ -66,19 +41,19 @@ class FrameEvaluator:
         self.contact = mode.contact
         spec = mode.contact.setup.sensor
         self.spec, self.reference = spec, nominal_reference(spec, Form.RAW)
-        self._pipeline = Pipeline(spec, Form.RAW)
+        self.pipeline = Pipeline(spec, Form.RAW)
         self._detector = make_detector(spec, shipped_detector(spec, Form.RAW))
         pitch_px = float(np.mean(self.reference.spacing_px))
         self.limits = {m.name: m.limit * (pitch_px if m.in_pitches else 1.0) for m in MEASURES}
 
-    def __call__(self, answer: ContactAnswer, cases: list[tuple[DegradedCase, float]], shading: Shading) -> EvaluatedFrame:
-        """Evaluate a contact with cases, each at its severity."""
+    def __call__(
+        self, answer: ContactAnswer, cases: list[tuple[DegradedCase, float]], shading: Shading
+    ) -> tuple[DegradedFrame, dict[str, float], list[str]]:
+        """A contact's frame with cases, each at its severity; its values by the names of ``MEASURES``; titles of those beyond limits."""
         touched = bool(len(answer.state.contact_mm))
         shot = degraded_state(self.spec, answer.state, cases, shading=shading, touched=touched)
         figures = measure_frame(self._detector, self._detector(shot.frame), shot)
-        failed = tuple(m.title for m in MEASURES if m.exceeds(figures[m.name], self.limits[m.name]))
-        _, estimate, seen = self.contact.observe(shot.frame, Form.RAW, self._pipeline)
-        return EvaluatedFrame(shot, seen, figures, failed, estimate)
+        return shot, figures, [m.title for m in MEASURES if m.exceeds(figures[m.name], self.limits[m.name])]
 
 
 class DegradeMode(PageMode):
@@ -156,17 +131,17 @@ class DegradeMode(PageMode):
             self._edge = self._edge_of(judge, answer, shading)
             self._finding = not self._edge  # a newer contact came, so the search must be repeated for it
         cases = self.cases()
-        judged = judge(answer, cases, shading)
+        shot, figures, failed = judge(answer, cases, shading)
+        frame, estimate, seen = judge.contact.observe(shot.frame, Form.RAW, judge.pipeline)
         ms = 1e3 * (time.perf_counter() - started)
-        frame = judged.degraded.frame
-        pictures = frame_pictures(judge.spec, judge.reference, frame, judged.seen)
+        pictures = frame_pictures(judge.spec, judge.reference, frame, seen)
         words = "; ".join(f"{case.title} {case.label(severity)}" for case, severity in cases if severity) or "no degradation"
         numbers = [
             badge("degraded" if any(severity for _, severity in cases) else "not degraded") + badge("rasterised"),
             paragraph(words, "note"),
-            _measures(judged, judge.limits),
-            paragraph("" if judged.seen.valid else f"The pipeline refuses the frame: {judged.seen.reason}", "stop"),
-            estimate_table(judged.estimate, answer.labels) if judged.degraded.touched else "",
+            _measures(figures, failed, judge.limits),
+            paragraph("" if seen.valid else f"The pipeline refuses the frame: {seen.reason}", "stop"),
+            estimate_table(estimate, answer.labels) if shot.touched else "",
             paragraph(self._edge, "said"),
             paragraph(f"{ms:.0f} ms latency", "note"),
         ]
@@ -183,7 +158,7 @@ class DegradeMode(PageMode):
         for severity in SEVERITIES:
             if self._wanted.overtaken:
                 return ""
-            failed = judge(answer, [(case, severity), *others], shading).failed
+            _, _, failed = judge(answer, [(case, severity), *others], shading)
             if failed and severity == 0.0:
                 return f"This frame fails without {case.title}, too: {', '.join(failed)}."
             if failed:
@@ -193,12 +168,12 @@ class DegradeMode(PageMode):
         return f"Breaking point of this contact: {case.title} is tolerated up to its most severe value, {case.label(1.0)}."
 
 
-def _measures(judged: EvaluatedFrame, limits: dict[str, float]) -> str:
+def _measures(figures: dict[str, float], failed: list[str], limits: dict[str, float]) -> str:
     """HTML of the measures with their limits."""
     rows = []
     for m in MEASURES:
-        value = judged.figures[m.name]
-        kind = "bad" if m.title in judged.failed else "" if np.isnan(value) else "good"
+        value = figures[m.name]
+        kind = "bad" if m.title in failed else "" if np.isnan(value) else "good"
         limit = f"{'at least' if m.least else 'at most'} {limits[m.name]:.3g} {m.unit}"
         shown = "-" if np.isnan(value) else f"{value:.3f}"
         rows.append(f"<tr><td>{m.title}</td><td class='{kind}'>{shown}</td><td>{limit}</td></tr>")

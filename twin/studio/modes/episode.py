@@ -13,9 +13,8 @@ from twin.estimate import pins_in
 from twin.geometry.pins import rest_pins
 from twin.optics.surfaces import PaintedSurface, SkinSurface
 from twin.pins import Pipeline, nominal_reference
-from twin.studio.live_page import frame_pictures
 from twin.studio.modes.mode import PageMode
-from twin.studio.page import LineChart, StudioPage
+from twin.studio.page import LineChart, StudioPage, frame_pictures
 from twin.studio.pictures import badge, number_table, pins_found
 from twin.studio.scene import PinColour, PinScene, colours
 from twin.types import FloatArray, Form, Frame, PinState

@@ -9,6 +9,7 @@ from twin.studio.worker import Newest
 from twin.types import ImageArray
 
 T = TypeVar("T")
+Pictures = tuple[ImageArray, ImageArray]
 
 
 class PageMode(ABC):
@@ -77,13 +78,7 @@ class PageMode(ABC):
         self._page.say(text, bad=True)
 
     def put_up(
-        self,
-        pictures: tuple[ImageArray, ImageArray],
-        label: str,
-        numbers: list[str],
-        *,
-        below: str = CELLS,
-        also: Callable[[], None] = lambda: None,
+        self, pictures: Pictures, label: str, numbers: list[str], *, below: str = CELLS, also: Callable[[], None] = lambda: None
     ) -> None:
         """Show two pictures (h, w, 3) RGB and numbers, and call ``also``, if the mode is still chosen. Browsers get all of it together."""
 

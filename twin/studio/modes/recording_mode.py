@@ -16,10 +16,9 @@ from twin.rig.contact import RigContact
 from twin.rig.labels import ArmLabel, poses_and_moves, read_arm_labels
 from twin.studio.camera import dome_part
 from twin.studio.contact import MovingContact, experiment_of
-from twin.studio.live_page import frame_pictures
 from twin.studio.modes.mode import PageMode
 from twin.studio.modes.twin_mode import TwinMode
-from twin.studio.page import CELLS, StudioPage, put
+from twin.studio.page import CELLS, StudioPage, frame_pictures, put
 from twin.studio.pictures import badge, estimate_table, number_table, paragraph
 from twin.types import Form, Frame, ImageArray, Observation
 

@@ -17,18 +17,16 @@ from twin.estimate import SensorModel, readable_labels
 from twin.frames.images import write_image
 from twin.objects import build_field
 from twin.pins import nominal_reference
-from twin.report.table import force_interval
+from twin.report.page import force_interval
+from twin.store.atomic import make_folder
 from twin.studio.contact import ContactAnswer, ContactSetup, Light, MovingContact
-from twin.studio.live_page import frame_pictures
 from twin.studio.modes.mode import PageMode
-from twin.studio.page import LineChart, StudioPage, put, value_of
-from twin.studio.pictures import OverlayChoices, badge, estimate_table, number_table, paragraph, pins_found
+from twin.studio.page import LineChart, StudioPage, frame_pictures, put, value_of
+from twin.studio.pictures import FilmWriter, OverlayChoices, badge, estimate_table, number_table, paragraph, pins_found
 from twin.studio.pose import LIMITS, NAMES, ObjectPose, PressedPose, readable_name, unit_of
 from twin.studio.scene import FULL_SCALE, PinColour, Scene
-from twin.studio.state import LAST_STATE, StudioState, Way, heading, make_folder, next_path, read_trajectory, save_trajectory, tap_and_shear
-from twin.studio.tracing import Tracer
-from twin.studio.video import FilmWriter
-from twin.studio.worker import Worker
+from twin.studio.state import LAST_STATE, StudioState, Way, heading, next_path, read_trajectory, save_trajectory, tap_and_shear
+from twin.studio.worker import Tracer, Worker
 from twin.types import Form
 
 ModelOf = Callable[[str], SensorModel | None]

@@ -64,70 +64,19 @@ def block_diagonal(rows: csr_array, chosen: np.ndarray) -> torch.Tensor:
         return torch.sparse_csr_tensor(indptr, column, weight, size, check_invariants=False)
 
 
-class GraphConvolution(torch.autograd.Function):
-    """``leaky_relu(batch_norm(A h W^T))`` in training, with the statistics of the batch (Ioffe and Szegedy 2015).
-
-    The statistics of the norm follow from the mean m and the covariance S of ``a = A h``: output channel c has the mean ``W_c m`` and
-    the variance ``W_c S W_c^T``. With these the norm is linear. Therefore norm and weights are one product with ``K W``,
-    ``K = diag(gain / deviation)``, and no pass over the wider output is needed. A bias before the norm would cancel, so there is none.
-    ``backward`` is the derivative of the same formulas and uses the transpose of A.
-    """
+class NeighbourMean(torch.autograd.Function):
+    """Product A h of a sparse matrix (V, V) and nodes (V, C). PyTorch's own derivative would transpose A for every batch."""
 
     @staticmethod
-    def forward(
-        ctx: Any,  # PyTorch declares no type for an object with these attributes
-        matrix: torch.Tensor,
-        transpose: torch.Tensor,
-        h: torch.Tensor,
-        weight: torch.Tensor,
-        gain: torch.Tensor,
-        offset: torch.Tensor,
-        eps: float,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Activations (V, D) of the nodes of all graphs, and mean and variance (D,) of the norm's inputs.
-
-        Parameters
-        ----------
-        matrix, transpose : (V, V) sparse rows
-            A and its transpose.
-        h : (V, C) float
-        weight : (D, C) float
-        gain, offset : (D,) float
-            Parameters of the norm.
-        eps : float
-            Added to the variance, so that a constant channel does not lead to a division by 0.
-        """
-        around = _product(matrix, h)
-        mean = around.mean(dim=0)
-        around.sub_(mean)
-        spread = weight @ (around.T @ around).div_(len(around))  # W S
-        variance = (spread * weight).sum(dim=1)
-        inverse = (variance + eps).rsqrt()
-        out = torch.addmm(offset, around, ((gain * inverse)[:, None] * weight).T)
-        out = nn.functional.leaky_relu_(out, SLOPE)
+    def forward(ctx: Any, matrix: torch.Tensor, transpose: torch.Tensor, h: torch.Tensor) -> torch.Tensor:
+        """The product; ``transpose`` is the transpose of ``matrix``."""
         ctx.transpose = transpose
-        ctx.save_for_backward(around, out, weight, gain, spread, inverse)
-        mean = weight @ mean
-        ctx.mark_non_differentiable(mean, variance)
-        return out, mean, variance
+        return _product(matrix, h)
 
     @staticmethod
-    def backward(ctx: Any, gradient: torch.Tensor, *_: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        """Derivatives with respect to the arguments of ``forward``, from those with respect to its activations (V, D)."""
-        around, out, weight, gain, spread, inverse = ctx.saved_tensors
-        size = gain * inverse
-        of_norm = torch.ops.aten.leaky_relu_backward(gradient, out, SLOPE, True)  # derivatives by the norm's output
-        of_offset = (of_norm.new_ones(1, len(of_norm)) @ of_norm)[0]
-        pull = of_norm.T @ around
-        of_gain = (pull * weight).sum(dim=1) * inverse
-        of_weight = size[:, None] * (pull - (of_gain * inverse)[:, None] * spread)
-        of_h = None
-        if ctx.needs_input_grad[2]:
-            share = size * of_gain * inverse / len(out)
-            of_around = torch.addmm(-(size * of_offset / len(out)) @ weight, of_norm, size[:, None] * weight)
-            of_around.addmm_(around, weight.T @ (share[:, None] * weight), alpha=-1)
-            of_h = _product(ctx.transpose, of_around)
-        return None, None, of_h, of_weight, of_gain, of_offset, None
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[None, None, torch.Tensor | None]:
+        """Derivatives with respect to the arguments of ``forward``."""
+        return None, None, _product(ctx.transpose, gradient) if ctx.needs_input_grad[2] else None
 
 
 def _product(matrix: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
@@ -178,18 +127,8 @@ class Gcn(nn.Module):
         """
         graphs, nodes = x.shape[:2]
         h = x.reshape(graphs * nodes, -1)
-        for layer, norm in zip(cast(list[nn.Linear], self.convolutions), cast(list[nn.BatchNorm1d], self.norms), strict=True):
-            running_mean, running_var = cast(torch.Tensor, norm.running_mean), cast(torch.Tensor, norm.running_var)
-            if not self.training:
-                size = norm.weight * (running_var + norm.eps).rsqrt()
-                out = torch.addmm(norm.bias - size * running_mean, matrix @ h, (size[:, None] * layer.weight).T)
-                h = nn.functional.leaky_relu_(out, SLOPE)
-                continue
-            h, mean, variance = GraphConvolution.apply(matrix, transpose, h, layer.weight, norm.weight, norm.bias, norm.eps)
-            with torch.no_grad():
-                momentum = cast(float, norm.momentum)
-                running_mean.lerp_(mean, momentum)
-                running_var.lerp_(variance * (len(h) / max(len(h) - 1, 1)), momentum)
+        for layer, norm in zip(self.convolutions, self.norms, strict=True):
+            h = nn.functional.leaky_relu_(norm(layer(NeighbourMean.apply(matrix, transpose, h))), SLOPE)
         return {"mean": self.dense(h.view(graphs, nodes, -1).mean(dim=1))}
 
 

@@ -17,10 +17,9 @@ from training.data.dataset import load_dataset
 from training.errors import TrainingError
 from training.estimate.estimator import PoseEstimator
 from training.studies.sim_to_real import SimToRealPlan
-from training.studies.sim_to_real.label_efficiency import label_efficiency
 from training.studies.sim_to_real.model_inversion import READ, read_twin
 from training.studies.sim_to_real.steps import BOTH, EVENLY, REAL, arm_labels
-from training.studies.sim_to_real.study import teach
+from training.studies.sim_to_real.study import label_efficiency, teach
 from twin.cli import command_line
 from twin.errors import FrameError, TwinError
 from twin.pins import nominal_reference

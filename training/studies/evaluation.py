@@ -14,8 +14,8 @@ from training.data.dataset import Dataset, join_datasets, load_dataset
 from training.data.simulated import is_simulated
 from training.errors import TrainingError
 from training.estimate.contact_estimator import ContactEstimator, contacts_folder
-from training.estimate.displacements import MOST_CONTACTS, OTHER_UNIT
 from training.estimate.estimator import PoseEstimate, PoseEstimator
+from training.estimate.rest import MOST_CONTACTS, OTHER_UNIT
 from training.runs.config import changed_since, trained_before
 from training.runs.run_files import folder_of
 from training.studies.judging import measure_changes, measure_errors, rows_to_evaluate, time_frames, write_evaluation

@@ -11,9 +11,9 @@ from scenes import SensorSpec
 from training.data.dataset import Dataset, join_datasets, load_dataset, with_common_labels
 from training.data.simulated import is_simulated
 from training.data.targets import CONTACT, PRESETS, SHEAR, TURN
-from training.estimate.displacements import learn_displacements, write_displacements
 from training.estimate.domain import learn_domain, write_domain
 from training.estimate.estimator import PoseEstimator
+from training.estimate.rest import learn_displacements, write_displacements
 from training.models import model_named, recipe_of
 from training.models.part import LIKELY
 from training.models.touch.model import TOUCH

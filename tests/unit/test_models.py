@@ -223,7 +223,7 @@ def test_lost_pins_follow_the_modes_of_the_others():
     lost = np.zeros(60, bool)
     lost[[4, 17, 30]] = True
     spoilt = np.where(lost[:, None], frames[270] + 5, frames[270])
-    filled = registration.fill(spoilt, lost)
+    filled = registration.fill(spoilt[None], lost[None])[0]
     assert np.array_equal(filled[~lost], frames[270][~lost]) and np.abs(filled - frames[270]).max() < 0.3
 
 

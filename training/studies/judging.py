@@ -6,8 +6,9 @@ displaced in a random direction, or pins are removed. The result is the increase
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from time import perf_counter
+from timeit import timeit
 from typing import Any
 
 import cv2
@@ -166,14 +167,9 @@ def time_frames(estimator: Callable[[Frame], object], data: Dataset) -> float | 
     try:
         frames = [recording.read(k) for k in np.linspace(0, len(recording) - 1, min(TIMED_FRAMES, len(recording))).astype(int)]
         estimator(frames[0])
-        taken = []
-        for frame in frames:
-            started = perf_counter()
-            estimator(frame)
-            taken.append(1e3 * (perf_counter() - started))
+        return 1e3 * float(np.median([timeit(partial(estimator, frame), number=1) for frame in frames]))
     finally:
         torch.set_num_threads(threads)
-    return float(np.median(taken))
 
 
 def write_evaluation(out: Path, made: Prediction, data: Dataset, rows: np.ndarray, metrics: dict, labels: str) -> list[Path]:

@@ -124,12 +124,7 @@ def compare_with_renders(
     if test and len(pairs) > 1:
         with bar("train the two-sample test") as step:
             outcome = _two_sample([pair.real.frame.image for pair in pairs], [pair.image for pair in pairs], disc.inside, thorough, step)
-    metrics = {
-        "sensor": spec.name,
-        "quality": quality,
-        "frames": len(pairs),
-        "fitted": fitted,
-        "without": sorted(without),
+    metrics = {"sensor": spec.name, "quality": quality, "frames": len(pairs), "fitted": fitted, "without": sorted(without)} | {
         "refused": real.refused,
         "disc": {"center_px": disc.center_px.tolist(), "radius_px": disc.radius_px},
         "pin_aligned": report.image_summary(pairs),

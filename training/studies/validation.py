@@ -7,8 +7,7 @@ from typing import Any
 
 from scenes import ExperimentSpec, ObjectSpec, SensorSpec, load_object
 from twin.calibration.contact.forces import FILES, ForceComparison, ForceSetup, compare_table, is_table
-from twin.evaluation.labelled import ContactModel, compare, measure_frames
-from twin.evaluation.labelled.compare import Comparison
+from twin.evaluation.labelled import Comparison, ContactModel, compare, measure_frames
 from twin.evaluation.labelled.report import summary_of, write_validation
 from twin.progress import Progress, silent, stage
 from twin.store import writes

@@ -20,8 +20,7 @@ from torch import nn
 from training.data.pins import PinTable
 from training.models.part import Learnt, PinModel, Recipe, refuse_sizes
 from twin.frames.forms import frame_size
-from twin.pins import make_graph
-from twin.pins.labelling.reference import Reference
+from twin.pins import Reference, make_graph
 
 CHANNELS = (16, 32, 48, 64, 96)
 DENSE = {"paper": (96, 64), "release": (128, 96)}

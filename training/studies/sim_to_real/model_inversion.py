@@ -30,9 +30,10 @@ from scenes import ExperimentSpec, ObjectSpec
 from training.data.dataset import Dataset
 from training.data.label_code import wrapped_deg
 from training.data.targets import unit_of
+from training.estimate.contact_estimator import DisplacementModes
 from training.runs.gaussian_process import Kernel, Points, Posterior, Term, fit_processes
 from training.studies.sim_to_real.field import MOST_FRAMES, MOVES_FROM, Left, Missed, TwinField, parts
-from training.studies.sim_to_real.steps import MODES, arm_labels, label_errors, stands_and_moves, states_touching, states_within
+from training.studies.sim_to_real.steps import MODES, arm_labels, error_row, stands_and_moves, states_touching, states_within
 from twin.frames import spread_indices
 from twin.rig.labels import ArmLabel
 
@@ -338,27 +339,19 @@ class TwinForwards:
         rng = np.random.default_rng(seed)
         rows = np.sort(rng.permutation(len(known_labels))[:MOST_STATES])
         noisy_px = moved_px[rows] + rng.normal(0, NOISE_PX, moved_px[rows].shape)
-        flat, known_labels = noisy_px.reshape(len(rows), -1), known_labels[rows]
-        self._rest = flat.mean(axis=0)
-        _, sizes, directions = np.linalg.svd(flat - self._rest, full_matrices=False)
-        keep = min(MODES, len(rows) - 1)
-        self._modes = directions[:keep].T * np.sqrt(len(rows)) / sizes[0]
+        known_labels, self._modes = known_labels[rows], DisplacementModes.of(noisy_px, MODES)
         self._middle, self._scale = known_labels.mean(axis=0), known_labels.std(axis=0)
-        self._twin, _ = fit_processes(self._inputs(noisy_px), (known_labels - self._middle) / self._scale, seed=seed)
+        self._twin, _ = fit_processes(self._modes(noisy_px), (known_labels - self._middle) / self._scale, seed=seed)
 
     def estimate(self, real_px: np.ndarray, known_labels: np.ndarray, wanted_px: np.ndarray) -> np.ndarray:
         """Labels (B, K) of frames with displacements (B, N, 2), after n labelled ones (n, N, 2) with labels (n, K)."""
-        asked = Points.of(self._inputs(wanted_px))
+        asked = Points.of(self._modes(wanted_px))
         found = self._twin(asked)
         if len(known_labels):
-            known = Points.of(self._inputs(real_px))
+            known = Points.of(self._modes(real_px))
             missed = (known_labels - self._middle) / self._scale - self._twin(known)
             found = found + np.column_stack([_difference(known, label).mean(asked) for label in missed.T])
         return np.asarray(found * self._scale + self._middle)
-
-    def _inputs(self, moved_px: np.ndarray) -> np.ndarray:
-        """Amplitudes (B, D) of the leading modes."""
-        return np.asarray((moved_px.reshape(len(moved_px), self._rest.size) - self._rest) @ self._modes)
 
 
 def _difference(known: Points, missed: np.ndarray) -> Posterior:
@@ -483,8 +476,7 @@ def read_row(
     moved = real.pins.nodes_px - real.pins.reference.pins_px
     found = twin.estimate(moved[rows], [labels[row] for row in rows], moved[test], None if unlabelled is None else moved[unlabelled])
     targets = real.targets.rows(test)
-    row = {"trained_on": name, "labelled_frames": len(rows), "model": READ}
-    return row | label_errors(named_labels(found, targets.names), targets)
+    return error_row(name, len(rows), READ, named_labels(found, targets.names), targets)
 
 
 def named_labels(found: np.ndarray, names: Sequence[str]) -> np.ndarray:

@@ -191,7 +191,11 @@ def run(plan: SimToRealPlan, out: Path, *, progress: Progress = silent) -> SimTo
     rows: list[dict[str, Any]] = []
     for twin in ground.twins:
         folder, given = out / twin.name, plan.simulated if twin is ground.full else ()
-        missing = _missing(ground, twin) if twin.learns else None
+        missing = None
+        if twin.learns:
+            with stage(progress, f"{twin.name}: labelled frames") as step:  # what was simulated for another twin is not simulated again
+                setup = replace(ground.setup, across=twin.across)
+                missing = Discrepancy(measure_residuals(setup, ground.measured, step, frictions=twin.frictions))
         if twin.contacts not in sets:
             sets[twin.contacts] = twin.simulated_sets(plan, out, ground.setup.sensor, real.pins.form, given, progress)
         learnt = _training_sets(ground, twin, sets[twin.contacts], missing)
@@ -230,13 +234,6 @@ def _prepare(plan: SimToRealPlan, out: Path, progress: Progress) -> Ground:
     full = steps.full_twin(plan, setup.sensor, measured.labels, (residuals.friction_spread() or moves.friction) if sheared else None)
     others = steps.without_one_ingredient(full, steps.as_mounted(plan.sensor), moves, load_randomisation("contact")) if plan.ablate else []
     return Ground(plan, out, progress, setup, real, few, chosen, measured, residuals, full, [full, *others])
-
-
-def _missing(ground: Ground, twin: steps.Twin) -> Discrepancy:
-    """The discrepancy of a twin. Contacts that were simulated for another one are not simulated again."""
-    with stage(ground.progress, f"{twin.name}: labelled frames") as step:
-        setup = replace(ground.setup, across=twin.across)
-        return Discrepancy(measure_residuals(setup, ground.measured, step, frictions=twin.frictions))
 
 
 def _training_sets(ground: Ground, twin: steps.Twin, sets: list[Dataset], missing: Discrepancy | None) -> list[Dataset]:
@@ -370,8 +367,8 @@ def errors_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
         key = f"{name}_corrected"
         models = dict.fromkeys(row["model"] for row in _of(rows, REAL))
         for model, (color, line) in zip(models, STYLES[-len(models) :], strict=False):
-            _curve(ax, _model(rows, REAL, model), key, line, color, f"real frames, {model}")
-            _curve(ax, _model(rows, f"{REAL}{EVENLY}", model), key, "s:", color, f"evenly chosen frames, {model}")
+            _curve(ax, rows, key, (REAL, model), line, color, f"real frames, {model}")
+            _curve(ax, rows, key, (f"{REAL}{EVENLY}", model), "s:", color, f"evenly chosen frames, {model}")
         for row in _of(rows, SIMULATED):
             ax.axhline(row[key], color=BLUE, ls=(0, (5, 2)), label="twin alone")
         for row in _of(rows, BOTH):
@@ -379,8 +376,8 @@ def errors_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
                 ax.plot(row["labelled_frames"], row[key], "*", color=PURPLE, ms=13, label="twin and labelled frames")
             elif not row["labelled_frames"]:
                 ax.axhline(row[key], color=PURPLE, ls=(0, (1, 2)), label="model inversion, no label")
-        _curve(ax, _model(rows, BOTH, READ), key, "^-", PURPLE, "model inversion")
-        _curve(ax, _model(rows, f"{BOTH}{EVENLY}", READ), key, "^:", PURPLE, "model inversion, evenly chosen frames")
+        _curve(ax, rows, key, (BOTH, READ), "^-", PURPLE, "model inversion")
+        _curve(ax, rows, key, (f"{BOTH}{EVENLY}", READ), "^:", PURPLE, "model inversion, evenly chosen frames")
         ax.set(title=f"{label} error", xlabel="labelled real frames", ylabel=f"mean absolute error, {unit_of(name)}")
         ax.set(xscale="log", yscale="log")
         counts = sorted({row["labelled_frames"] for row in rows if row["labelled_frames"]})
@@ -391,16 +388,11 @@ def errors_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
     return figure
 
 
-def _model(rows: Sequence[Mapping], trained_on: str, model: str) -> list[Mapping]:
-    """Rows of one model with labelled frames, by their number."""
-    mine = [row for row in _of(rows, trained_on) if row["model"] == model and row["labelled_frames"]]
-    return sorted(mine, key=lambda row: row["labelled_frames"])
-
-
-def _curve(ax: Axes, rows: Sequence[Mapping], key: str, line: str, color: str, label: str) -> None:
-    """The errors of some rows by their numbers of labelled frames."""
-    if rows:
-        ax.plot([row["labelled_frames"] for row in rows], [row[key] for row in rows], line, color=color, label=label)
+def _curve(ax: Axes, rows: Sequence[Mapping], key: str, of: tuple[str, str], line: str, color: str, label: str) -> None:
+    """The errors of the rows of what was trained on, and model, by their numbers of labelled frames."""
+    known = sorted((row["labelled_frames"], row[key]) for row in rows if (row["trained_on"], row["model"]) == of and row["labelled_frames"])
+    if known:
+        ax.plot(*zip(*known, strict=True), line, color=color, label=label)
 
 
 def ingredients_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:

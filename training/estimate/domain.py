@@ -329,11 +329,8 @@ class Domain:
         k = int(np.argmax(excess / np.maximum(self.high - self.low, 1e-9)))
         if excess[k] <= BEYOND_RANGE * (self.high[k] - self.low[k]):
             return "", excess
-        return (
-            f"outside the trained range: {readable_labels(names)[k]} {value[k]:.3g} {units[k]}, trained from {self.low[k]:.3g} to "
-            f"{self.high[k]:.3g} {units[k]}".rstrip(),
-            excess,
-        )
+        trained = f"trained from {self.low[k]:.3g} to {self.high[k]:.3g} {units[k]}".rstrip()
+        return f"outside the trained range: {readable_labels(names)[k]} {value[k]:.3g} {units[k]}, {trained}", excess
 
     def _why(self, found: Strangeness, moved: FloatArray, lost: BoolArray, reference: Reference) -> str:
         """The most probable cause of a strange frame, in words."""

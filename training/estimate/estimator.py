@@ -412,7 +412,7 @@ class PoseEstimator:
         if slip is not None:
             value, low, high = (np.concatenate(pair) for pair in zip((value, low, high), slip.values, strict=True))
         head = self.names, self.units, value, low, high, executed
-        return PoseEstimate(*head, True, "", _ms(started), contact, made.touched, notes, made.seen)
+        return PoseEstimate(*head, True, "", 1e3 * (perf_counter() - started), contact, made.touched, notes, made.seen)
 
     def pins_in(self, frame: Frame) -> OneFrame | Unseen:
         """The pins of one frame, or the reason why they can't be used; raises as a call does."""
@@ -473,7 +473,7 @@ class PoseEstimator:
             self._tracker.forget()
         none = np.full(len(self.names), np.nan)
         head = self.names, self.units, none, none, none, np.nan
-        return PoseEstimate(*head, False, seen.reason, _ms(started), contact, seen.touched, seen=seen.seen)
+        return PoseEstimate(*head, False, seen.reason, 1e3 * (perf_counter() - started), contact, seen.touched, seen=seen.seen)
 
     def predict_rows(self, data: Dataset, rows: np.ndarray) -> Prediction:
         """Estimate the labels of some rows (B,) of a data set whose frames are all of one camera.
@@ -517,10 +517,6 @@ class PoseEstimator:
         if not isinstance(self.part, PinModel):
             raise TrainingError(f"{self.model} estimates from pictures, not from pins; give the frames themselves")
         return self.part
-
-
-def _ms(started: float) -> float:
-    return 1e3 * (perf_counter() - started)
 
 
 def models_by_sensor(run: str | Path | None = None, first: str = "") -> Callable[[str], PoseEstimator | None]:

@@ -524,8 +524,5 @@ def compare_slip(model: SlipModel, paths: Sequence[DragPath]) -> dict[str, float
     found["late"] = [lead < 0 for lead in found["lead_mm"]]
     counts = {"contacts": len(paths), "frames": len(found["whole_accuracy"])}
     direction_deg = float(np.median(turned)) if turned else float("nan")
-    return counts | {name: _mean(values) for name, values in found.items()} | {"direction_deg": direction_deg}
-
-
-def _mean(values: Sequence[float]) -> float:
-    return float(np.mean(values)) if values else float("nan")
+    means = {name: float(np.mean(values)) if values else float("nan") for name, values in found.items()}
+    return counts | means | {"direction_deg": direction_deg}

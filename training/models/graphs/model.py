@@ -30,11 +30,11 @@ SLOPE = 0.01
 RELEASE_PX = 300.0
 
 
-def graph_rows(edges: list[np.ndarray], nodes: int, *, transposed: bool = False) -> csr_array:
-    """Normalised adjacency (M N, N) of M graphs of ``nodes`` nodes, one below the other, or its transposes.
+def graph_rows(edges: list[np.ndarray], nodes: int) -> csr_array:
+    """Normalised adjacency (M N, N) of M graphs of ``nodes`` nodes, one below the other.
 
-    A row holds the in-edges of a node (``transposed``: its out-edges) with the weights ``1 / sqrt(d_i d_j)``, d being the in-degree
-    including the loop that is added to every node.
+    A row holds the in-edges of a node with the weights ``1 / sqrt(d_i d_j)``, d being the in-degree including the loop that is added to
+    every node.
 
     Parameters
     ----------
@@ -46,21 +46,21 @@ def graph_rows(edges: list[np.ndarray], nodes: int, *, transposed: bool = False)
     source, target = (np.concatenate([ends, loop]) for ends in every.T)
     degree = np.bincount(target)
     weight = (1 / np.sqrt(degree[source] * degree[target])).astype(np.float32)
-    row, column = (source, target) if transposed else (target, source)
-    return csr_array((weight, (row, column % nodes)), shape=(len(loop), nodes))
+    return csr_array((weight, (target, source % nodes)), shape=(len(loop), nodes))
 
 
-def block_diagonal(rows: csr_array, chosen: np.ndarray) -> torch.Tensor:
-    """The block diagonal matrix (B N, B N) of some of the graphs (B,) of ``graph_rows``, as sparse rows."""
+def block_diagonal(rows: csr_array, chosen: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+    """The block diagonal matrix (B N, B N) of some of the graphs (B,) of ``graph_rows``, and its transpose, both as sparse rows."""
     nodes = rows.shape[1]
     start = nodes * np.arange(len(chosen))
     found = rows[(nodes * chosen[:, None] + np.arange(nodes)).ravel()]
     column = found.indices + np.repeat(start, np.diff(found.indptr[np.append(start, len(start) * nodes)]))
-    indptr, column, weight = (torch.from_numpy(values) for values in (found.indptr.astype(np.int32), column.astype(np.int32), found.data))
-    size = (len(start) * nodes,) * 2
+    matrix = csr_array((found.data, column, found.indptr), shape=(len(start) * nodes,) * 2)
+    parts = [(each.indptr.astype(np.int32), each.indices.astype(np.int32), each.data) for each in (matrix, matrix.T.tocsr())]
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sparse CSR")  # "in beta state", said once
-        return torch.sparse_csr_tensor(indptr, column, weight, size, check_invariants=False)
+        made = [torch.sparse_csr_tensor(*map(torch.from_numpy, part), matrix.shape, check_invariants=False) for part in parts]
+    return made[0], made[1]
 
 
 class NeighbourMean(torch.autograd.Function):
@@ -139,23 +139,17 @@ class GraphInputs:
     features : (M, N, F) float
     edges : list of (E_k, 2) int arrays
         Directed edges of each of M graphs.
-    symmetric : bool
-        Whether every edge is given in both directions.
     """
 
-    def __init__(self, features: np.ndarray, edges: list[np.ndarray], *, symmetric: bool) -> None:
-        self.x = torch.from_numpy(features.astype(np.float32))
-        self.forward = graph_rows(edges, features.shape[1])
-        self.back = self.forward if symmetric else graph_rows(edges, features.shape[1], transposed=True)
+    def __init__(self, features: np.ndarray, edges: list[np.ndarray]) -> None:
+        self.x, self.rows = torch.from_numpy(features.astype(np.float32)), graph_rows(edges, features.shape[1])
 
     def __len__(self) -> int:
         return len(self.x)
 
     def batch(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Arguments of the network for some rows."""
-        chosen = rows.numpy()
-        matrix = block_diagonal(self.forward, chosen)
-        return self.x[rows], matrix, matrix if self.back is self.forward else block_diagonal(self.back, chosen)
+        return self.x[rows], *block_diagonal(self.rows, rows.numpy())
 
 
 def pixel_features(nodes_px: np.ndarray, area_px2: np.ndarray | None, width_px: int) -> np.ndarray:
@@ -183,18 +177,14 @@ class GraphModel(PinModel):
     def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> Gcn:
         """See ``Model``; there are no sizes."""
         refuse_sizes(self, size)
-        return Gcn(3 if self._sees_areas else 2, outputs, self.dense)
+        return Gcn(3 if self.edges == "delaunay" else 2, outputs, self.dense)
 
     def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> GraphInputs:
         """See ``PinModel``. Nothing is learnt before training, and the camera's place is not corrected."""
         width_px = frame_size(pins.sensor, pins.form)[0]
-        features = pixel_features(pins.nodes_px, pins.area_px2 if self._sees_areas else None, width_px)
+        features = pixel_features(pins.nodes_px, pins.area_px2 if self.edges == "delaunay" else None, width_px)
         edges = [make_graph(self.edges, nodes_px).edges for nodes_px in pins.nodes_px]
-        return GraphInputs(features, edges, symmetric=self._sees_areas)
-
-    @property
-    def _sees_areas(self) -> bool:
-        return self.edges == "delaunay"
+        return GraphInputs(features, edges)
 
 
 # Settings that the paper does not state are those of the published code, with two changes: the batches are smaller, so that there are

@@ -178,10 +178,8 @@ class Steered(nn.Module):
         sine = int(np.flatnonzero(np.repeat(code.circular, np.where(code.circular, 2, 1)))[0])
         self.sine.fill_(sine)
         seen, direction = self.coefficients(moved), torch.atan2(numbers[:, sine], numbers[:, sine + 1])
-        alike = [
-            float(self.turn_coefficients(seen, -sense * direction)[:, self.order != 0].mean(dim=0).abs().square().sum())
-            for sense in (1, -1)
-        ]
+        turned = [self.turn_coefficients(seen, -sense * direction)[:, self.order != 0] for sense in (1, -1)]
+        alike = [float(each.mean(dim=0).abs().square().sum()) for each in turned]
         self.sense.fill_(1.0 if alike[0] >= alike[1] else -1.0)
         copies = seen.repeat(COPIES, 1)
         self.first.prepare(self.turn_coefficients(copies, 2 * torch.pi * torch.rand(len(copies))))
@@ -275,10 +273,8 @@ class SteeredModel(PinModel):
         TrainingError
             Not exactly one label goes round the whole circle.
         """
-        if sum(code.circular) != 1:
-            raise TrainingError(
-                f"{self.name} is for labels of which one is a direction on the whole circle, these have {sum(code.circular)}; train vgnn"
-            )
+        if (many := sum(code.circular)) != 1:
+            raise TrainingError(f"{self.name} is for labels of which one is a direction on the whole circle, these have {many}; train vgnn")
         cast(Steered, network).prepare(inputs.batch(rows)[0], numbers[rows], code)
 
     def modes(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor) -> Modes:

@@ -88,12 +88,8 @@ class Bases:
     def __call__(self, moved: np.ndarray, light: np.ndarray) -> np.ndarray:
         """Features (M, D) of displacements (M, 2 N), rest spacings, and levels (M, N)."""
         moved, light = moved * np.repeat(self.seen, 2), light * self.seen
-        relative = (self.relative_of(moved) - self.relative_mean) @ self.relative
+        relative = (moved / (np.linalg.norm(moved, axis=1, keepdims=True) + self.small) - self.relative_mean) @ self.relative
         return np.concatenate([(moved - self.moved_mean) @ self.moved, relative, (light - self.light_mean) @ self.light], axis=1)
-
-    def relative_of(self, moved: np.ndarray) -> np.ndarray:
-        """Displacements (M, 2 N) divided by their norm plus ``small``."""
-        return moved / (np.linalg.norm(moved, axis=1, keepdims=True) + self.small)
 
     @classmethod
     def learn_bases(cls, moved: np.ndarray, light: np.ndarray, lost: np.ndarray, *, modes: int, light_modes: int) -> "Bases":

@@ -111,10 +111,7 @@ class Registration:
     def difference(self, nodes_px: np.ndarray) -> np.ndarray:
         """Differences (M, 4) between the frames' similarities and those expected from their contacts."""
         aligned, observed = align(nodes_px, self.rest_px)
-        return observed - _terms(self._modes(aligned)) @ self.weight
-
-    def _modes(self, aligned: np.ndarray) -> np.ndarray:
-        return (aligned.reshape(len(aligned), -1) - self.mean) @ self.components
+        return observed - _terms((aligned.reshape(len(aligned), -1) - self.mean) @ self.components) @ self.weight
 
 
 def fit_registration(nodes_px: np.ndarray, rest_px: np.ndarray) -> tuple[Registration, np.ndarray]:

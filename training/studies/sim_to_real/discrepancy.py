@@ -198,8 +198,7 @@ class Discrepancy:
                 own = process.kernel.noises[0] * rng.normal()  # noise of a frame; all states of a contact have the same
                 amplitudes[rows, k] = process.draw(Points.of(scaled[rows]), rng) + own
             shares[rows] = rng.normal(size=len(self.rest))
-        relative = (amplitudes * self.sizes) @ self.modes + shares @ self.rest
-        return (relative * _rms_px(moved_px)[:, None]).reshape(moved_px.shape)
+        return self._fields(amplitudes, moved_px, shares @ self.rest)
 
     def summary(self) -> list[dict]:
         """For each mode: its share of the residuals' variance, and the part of the mode's variance that the label explains."""
@@ -215,6 +214,10 @@ class Discrepancy:
 
     def _scale_axes(self, axes: np.ndarray) -> np.ndarray:
         return (self._known_labels(axes)[:, self.used] - self.middle) / self.spread
+
+    def _fields(self, amplitudes: np.ndarray, moved_px: np.ndarray, rest: np.ndarray) -> np.ndarray:
+        relative = (amplitudes * self.sizes) @ self.modes + rest
+        return (relative * _rms_px(moved_px)[:, None]).reshape(moved_px.shape)
 
 
 def _process(axes: np.ndarray, amplitude: np.ndarray) -> Posterior:

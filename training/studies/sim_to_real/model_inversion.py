@@ -226,7 +226,7 @@ class _Reader:
         several = frames.rows(frame)
         tried = [starts[frame, which], best[frame]]
         tried[1][:, turn] = tried[0][:, turn]
-        first, second = (self._objective(several, each) for each in tried)
+        first, second = (self._objective(each, self._residual(several, each)) for each in tried)
         labels, objective, _ = self._improve_labels(several, np.where((first < second)[:, None], *tried), self._unknown, 1)
         lowest = np.full(len(best), np.inf)
         np.minimum.at(lowest, frame, objective)
@@ -253,16 +253,14 @@ class _Reader:
         near = far.argmin(axis=1)
         return states[near], far[np.arange(len(near)), near]
 
-    def _improve_labels(
-        self, frames: _Frames, labels: np.ndarray, columns: list[int], steps: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _improve_labels(self, frames: _Frames, labels: np.ndarray, columns: list[int], steps: int) -> tuple[np.ndarray, ...]:
         """Labels (B, 12) after damped Gauss-Newton steps in some columns, J (B,) there, and the logarithm (B,) of the determinant of the
         normal matrix."""
         labels, field = labels.copy(), self._field
         half, prior = self._scales(columns)
         damping = np.full(len(labels), DAMPING)
         residual = self._residual(frames, labels)
-        objective = self._objective(frames, labels, residual)
+        objective = self._objective(labels, residual)
         normal = np.zeros((len(labels), len(columns), len(columns)))
         for _ in range(steps if columns else 0):
             slope = self._slopes(frames, labels, columns, half)
@@ -275,7 +273,7 @@ class _Reader:
             middle, reach = field.middle[self._unknown], BEYOND * field.half[self._unknown]
             moved[:, self._unknown] = np.clip(moved[:, self._unknown], middle - reach, middle + reach)
             there = self._residual(frames, moved)
-            lower = self._objective(frames, moved, there)
+            lower = self._objective(moved, there)
             better = lower < objective
             labels[better], residual[better], objective[better] = moved[better], there[better], lower[better]
             damping *= np.where(better, DAMPING_LESS, DAMPING_MORE)
@@ -287,9 +285,8 @@ class _Reader:
         half = np.array([DIRECTION_DEG if k == field.direction else field.half[k] for k in columns])
         return half, np.array([0.0 if k == field.direction else WIDTH**-2 for k in columns])
 
-    def _objective(self, frames: _Frames, labels: np.ndarray, residual: np.ndarray | None = None) -> np.ndarray:
-        """(B,) J at labels (B, 12)."""
-        left = self._residual(frames, labels) if residual is None else residual
+    def _objective(self, labels: np.ndarray, left: np.ndarray) -> np.ndarray:
+        """(B,) J at labels (B, 12) with the residual ``left`` (B, 2C)."""
         half, prior = self._scales(self._unknown)
         away = (labels[:, self._unknown] - self._field.middle[self._unknown]) / half
         return np.asarray((left**2).sum(axis=1) + (prior * away**2).sum(axis=1))
@@ -460,22 +457,14 @@ def read_twin(sets: list[Dataset], obj: ObjectSpec, experiment: ExperimentSpec, 
 
 
 def read_row(
-    name: str,
-    twin: TwinRead,
-    real: Dataset,
-    labels: Sequence[ArmLabel],
-    rows: np.ndarray,
-    test: np.ndarray,
-    *,
-    unlabelled: np.ndarray | None = None,
+    name: str, twin: TwinRead, real: Dataset, rows: np.ndarray, test: np.ndarray, *, unlabelled: np.ndarray | None = None
 ) -> dict[str, Any]:
     """A row of the study's table: the twin read after labelled frames ``rows`` (n,), evaluated on ``test`` (t,).
 
-    ``labels`` are those of all frames; those of the frames ``unlabelled`` (u,) are not used.
+    The labels of the frames ``unlabelled`` (u,) are not used.
     """
-    moved = real.pins.nodes_px - real.pins.reference.pins_px
+    labels, moved, targets = arm_labels(real), real.pins.nodes_px - real.pins.reference.pins_px, real.targets.rows(test)
     found = twin.estimate(moved[rows], [labels[row] for row in rows], moved[test], None if unlabelled is None else moved[unlabelled])
-    targets = real.targets.rows(test)
     return error_row(name, len(rows), READ, named_labels(found, targets.names), targets)
 
 

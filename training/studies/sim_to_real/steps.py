@@ -193,24 +193,21 @@ class Twin:
         parts: dict[str, Any] = {"sensor": self.sensor, "object": obj, "experiment": self.experiment, "randomisation": self.randomisation}
         return GenerationConfig(**parts, friction=rig_of(self.sensor).friction, seed=seed, images="none", states="all", across=self.across)
 
-    def simulated_sets(
-        self, plan: SimToRealPlan, out: Path, sensor: SensorSpec, form: Form, given: Sequence[Path], progress: Progress
-    ) -> list[Dataset]:
-        """Contacts as a sensor's data sets: the finished ones ``given``, or one simulated to the folder ``out`` if there are none."""
-        if not given:
-            given = [out / self.contacts]
+    def simulated_sets(self, plan: SimToRealPlan, out: Path, sensor: SensorSpec, form: Form, progress: Progress) -> list[Dataset]:
+        """Contacts as a sensor's data sets: for the full twin the plan's finished ones; if there are none, one simulated to ``out``."""
+        folders = list(plan.simulated) if self.name == FULL else []
+        if not folders:
+            folders = [out / self.contacts]
             with stage(progress, f"{self.name}: {self.experiment.name}") as step:
-                generate(given[0], self.config(plan.target_object, plan.seed), plan.count, workers=plan.workers, progress=step)
+                generate(folders[0], self.config(plan.target_object, plan.seed), plan.count, workers=plan.workers, progress=step)
         found = []
-        for folder in given:
+        for folder in folders:
             with stage(progress, f"states of {folder.name}") as step:
                 found.append(load_dataset(folder, sensor, plan.experiment.targets, form=form, progress=step))
         return found
 
     def part(self, contacts: Dataset) -> Dataset:
         """The states of the contacts that are used for training."""
-        if self.share == 1:
-            return contacts
         group = contact_of(contacts)
         numbers = np.unique(group)
         return contacts.rows(np.flatnonzero(np.isin(group, numbers[: int(np.ceil(self.share * len(numbers)))])))
@@ -478,10 +475,8 @@ def combine_co_kriging(run: Path, out: Path, simulated: Dataset, labelled: Datas
     mean, scale, executed = ensemble.outputs(inputs, rows)
     seen = ensemble.modes(inputs, rows).inputs
     known = ensemble.modes(*estimator.inputs_of(simulated.pins, together=not simulated.pins.measured)).inputs
-    truth = getattr(labelled.targets, labels)
-    process, alone = fit_two_fidelities(
-        known, ensemble.standardise(getattr(simulated.targets, labels)), seen, ensemble.standardise(truth), seed=seed
-    )
+    truth, told = (getattr(part.targets, labels) for part in (labelled, simulated))
+    process, alone = fit_two_fidelities(known, ensemble.standardise(told), seen, ensemble.standardise(truth), seed=seed)
     content = read_tensors(run / TENSORS)
 
     def widths(made: np.ndarray) -> dict[str, np.ndarray]:

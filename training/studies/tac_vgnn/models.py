@@ -114,11 +114,6 @@ def table_row(plan: PlannedRun, data: Dataset, out: Path, minutes: float | None)
     return row | {"paper_mm": paper[0], "paper_deg": paper[1]}
 
 
-def error_columns(data: Dataset) -> list[str]:
-    """Columns of a row that hold errors."""
-    return [f"{name}_{kind}" for kind in ("raw", "corrected") for name in data.targets.names]
-
-
 def read_curves(folder: Path) -> np.ndarray:
     """The learning curve of a run: a record of named numbers for each epoch, one network after the other."""
     return np.atleast_1d(np.genfromtxt(folder / "curves.csv", delimiter=",", names=True))

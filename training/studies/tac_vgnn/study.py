@@ -24,7 +24,7 @@ from training.data.pins import PinTable
 from training.data.targets import ANGLE, DEPTH, unit_of
 from training.models import model_named
 from training.runs.loop import choose_device
-from training.studies.tac_vgnn.models import PlannedRun, error_columns, measure_training, plan_run, read_curves, table_row, train_all
+from training.studies.tac_vgnn.models import PlannedRun, measure_training, plan_run, read_curves, table_row, train_all
 from training.surrogate.symmetry import about_z
 from twin.errors import OptionError, TwinError
 from twin.estimate import readable_labels
@@ -364,10 +364,9 @@ def write_page(out: Path, data: Dataset, tables: Mapping[str, list[dict]], plan:
     machine : str
         Device and number of threads.
     """
-    ranges = ", ".join(
-        f"{name} [{number(float(data.targets.raw[:, k].min()))}, {number(float(data.targets.raw[:, k].max()))}] {unit}"
-        for k, (name, unit) in enumerate(zip(readable_labels(data.targets.names), data.targets.units, strict=True))
-    )
+    ends = data.targets.raw.min(axis=0).tolist(), data.targets.raw.max(axis=0).tolist()
+    known = zip(readable_labels(data.targets.names), data.targets.units, *ends, strict=True)
+    ranges = ", ".join(f"{name} [{number(low)}, {number(high)}] {unit}" for name, unit, low, high in known)
     page = Page(
         f"The Tac-VGNN paper's comparison on {data.pins.sensor.name}",
         "twin study tac-vgnn",
@@ -387,7 +386,7 @@ def write_page(out: Path, data: Dataset, tables: Mapping[str, list[dict]], plan:
         f"that reads the time of the frame has not.{given} The error of a run that ended early is what it reached in its time, not what it "
         "would reach. The least error of each column is marked.",
     )
-    errors = error_columns(data)
+    errors = [f"{name}_{kind}" for kind in ("raw", "corrected") for name in data.targets.names]
     page.table(tables["models"], [_column(key, errors) for key in (*RUN, *errors, *FURTHER)])
     page.table(tables["models"], [_column(key) for key in (*RUN, *TRAINING)], caption="What training took")
     for key in errors:

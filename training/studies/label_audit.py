@@ -147,7 +147,7 @@ def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[P
     )
     page.notice("Not assessed, and no corrected labels written", [audit.not_assessed] if audit.not_assessed else [], tone="bad")
     page.notice("Notes on the recording", summary["reader"])
-    tables, charts = [], []
+    tables, charts = list[Path](), list[Path]()
     if not audit.not_assessed:
         labels = _correct_moves(data, audit.executed.round(), audit.depth_per_move)
         tables = [write_table(out / "labels_corrected.csv", _label_rows(audit, data, labels))]

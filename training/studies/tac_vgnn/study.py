@@ -299,9 +299,9 @@ class TacVgnnResult(ReadableResult):
         """The result as lines of text: the number of frames, then one for each run."""
         lines, labels = [f"{self.frames} labelled frames"], dict(zip(self.names, readable_labels(self.names), strict=True))
         for row in self.rows:
-            known = labels.items() if "epochs" in row else ()
-            errors = "; ".join(f"{label} {row[f'{name}_raw']:.4g} raw, {row[f'{name}_corrected']:.4g} corrected" for name, label in known)
-            lines.append(f"{row['model']}, seed {row['seed']}: {row['state']}{', ' if errors else ''}{errors}")
+            known = labels if "epochs" in row else {}
+            errors = [f"{label} {row[f'{name}_raw']:.4g} raw, {row[f'{name}_corrected']:.4g} corrected" for name, label in known.items()]
+            lines.append(f"{row['model']}, seed {row['seed']}: {row['state']}{', ' if errors else ''}{'; '.join(errors)}")
         return lines
 
 

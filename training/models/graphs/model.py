@@ -49,18 +49,18 @@ def graph_rows(edges: list[np.ndarray], nodes: int) -> csr_array:
     return csr_array((weight, (target, source % nodes)), shape=(len(loop), nodes))
 
 
-def block_diagonal(rows: csr_array, chosen: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+def block_diagonal(rows: csr_array, chosen: np.ndarray) -> tuple[torch.Tensor, ...]:
     """The block diagonal matrix (B N, B N) of some of the graphs (B,) of ``graph_rows``, and its transpose, both as sparse rows."""
     nodes = rows.shape[1]
     start = nodes * np.arange(len(chosen))
     found = rows[(nodes * chosen[:, None] + np.arange(nodes)).ravel()]
     column = found.indices + np.repeat(start, np.diff(found.indptr[np.append(start, len(start) * nodes)]))
     matrix = csr_array((found.data, column, found.indptr), shape=(len(start) * nodes,) * 2)
-    parts = [(each.indptr.astype(np.int32), each.indices.astype(np.int32), each.data) for each in (matrix, matrix.T.tocsr())]
+    both = matrix, matrix.T.tocsr()
+    parts: list[Any] = [map(torch.from_numpy, (each.indptr.astype(np.int32), each.indices.astype(np.int32), each.data)) for each in both]
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sparse CSR")  # "in beta state", said once
-        made = [torch.sparse_csr_tensor(*map(torch.from_numpy, part), matrix.shape, check_invariants=False) for part in parts]
-    return made[0], made[1]
+        return tuple(torch.sparse_csr_tensor(*part, matrix.shape, check_invariants=False) for part in parts)
 
 
 class NeighbourMean(torch.autograd.Function):

@@ -292,7 +292,7 @@ class VgnnModel(PinModel):
         taken = registration.difference(filled[0])
         taken[train] = left
         views = registration(*filled)[:2], registration.take_out(*filled, taken)
-        features = np.concatenate([pin_features(*view, pins.reference) for view in views])
+        features = np.concatenate([pin_features(nodes_px, area_px2, pins.reference) for nodes_px, area_px2 in views])
         inputs = PinInputs(features, np.concatenate([pins.lost, pins.lost]), np.repeat([0.0, 1.0], len(pins)))
         return Prepared(inputs, {"registration": vars(registration)}, views=2)
 

@@ -60,7 +60,7 @@ def block_diagonal(rows: csr_array, chosen: np.ndarray) -> tuple[torch.Tensor, .
     parts: list[Any] = [map(torch.from_numpy, (each.indptr.astype(np.int32), each.indices.astype(np.int32), each.data)) for each in both]
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sparse CSR")  # "in beta state", said once
-        return tuple(torch.sparse_csr_tensor(*part, size=matrix.shape, check_invariants=False) for part in parts)
+        return tuple(torch.sparse_csr_tensor(ends, column, weight, matrix.shape, check_invariants=False) for ends, column, weight in parts)
 
 
 class NeighbourMean(torch.autograd.Function):

@@ -52,7 +52,7 @@ _OFFERED = {
     "twin.types": ("Form", "Frame", "Observation"),
 }
 """By module: the names that are taken from it."""
-_RENAMED = {"load_model": "training.estimate.loading:load_with_history", "register_environments": "training.environments:register_all"}
+_RENAMED = {"load_model": "training.estimate.estimator:load_with_history", "register_environments": "training.environments:register_all"}
 """By public name: its module, and its other name there."""
 _PLACES = {name: place for place, names in _OFFERED.items() for name in names} | _RENAMED
 _MODULES = ("errors", "extend")

@@ -24,7 +24,7 @@ from training.environments import register_all as register_all
 from training.environments.baselines import BaselinesVecEnv as BaselinesVecEnv
 from training.environments.demonstrations import Demonstrations as Demonstrations
 from training.environments.learn import Learnt as Learnt
-from training.estimate.loading import load_with_history as load_with_history
+from training.estimate.estimator import load_with_history as load_with_history
 from training.generation.run import Simulated as Simulated
 from training.mujoco.model import attach_sensor as attach_sensor
 from training.mujoco.model import load_scene as load_scene

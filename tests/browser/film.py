@@ -17,7 +17,7 @@ from studio_client import StudioClient
 
 from hardware.live.studio_mode import LiveMode
 from scenes import load_sensor
-from training.estimate.loading import models_by_sensor
+from training.estimate.estimator import models_by_sensor
 from twin.studio.pictures import FilmWriter
 from twin.studio.pose import ObjectPose
 from twin.studio.scene import quaternion

@@ -16,8 +16,7 @@ from training.estimate.estimator import PoseEstimator
 from training.studies.evaluation import models_of_kinds
 from training.studies.judging import measure_errors
 from training.studies.sim_to_real import SimToRealPlan
-from training.studies.sim_to_real.label_efficiency import label_efficiency
-from training.studies.sim_to_real.study import errors_figure
+from training.studies.sim_to_real.study import errors_figure, label_efficiency
 from twin.frames import open_recording
 from twin.report.charts import write_chart
 from twin.store import write_json
@@ -98,7 +97,7 @@ def register() -> None:
             f"labels.{recording}",
             command,
             sensors=(sensor,),
-            code=("training.studies.sim_to_real.label_efficiency",),
+            code=("training.studies.sim_to_real.study",),
             recordings=(recording,),
             minutes=minutes,
             beside=NO_PICTURES,

@@ -14,8 +14,8 @@ import numpy as np
 from training.data.label_code import label_error
 from training.data.targets import choose_targets
 from training.estimate.contact_estimator import ContactEstimator, contacts_folder
-from training.estimate.displacements import MOST_CONTACTS
 from training.estimate.estimator import PoseEstimator
+from training.estimate.rest import MOST_CONTACTS
 from twin.errors import TwinError
 from twin.frames import evenly_read, open_recording
 from twin.rig.labels import label_slope

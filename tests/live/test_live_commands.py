@@ -35,8 +35,8 @@ from hardware.servo import following
 from hardware.servo.following import steps_round
 from hardware.workcell.build import build_rig
 from scenes import load_experiment, load_object, load_sensor, load_servo
-from training.estimate.displacements import FEWEST_CONTACTS
 from training.estimate.estimator import PoseEstimator
+from training.estimate.rest import FEWEST_CONTACTS
 from twin.camera.capture import expose, record
 from twin.cli import command_line
 from twin.errors import OptionError, TwinError

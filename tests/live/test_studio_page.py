@@ -23,7 +23,7 @@ from hardware.errors import DeviceError
 from hardware.live import studio_mode
 from hardware.live.studio_mode import CameraFeed, LiveMode, WatchedArm
 from scenes import load_sensor
-from training.estimate.loading import models_by_sensor
+from training.estimate.estimator import models_by_sensor
 from twin.errors import TwinError
 from twin.frames.images import write_image
 from twin.pins import nominal_reference

@@ -8,7 +8,7 @@ import pytest
 from browser_page import open_page
 
 from hardware.live.studio_mode import LiveMode
-from training.estimate.loading import models_by_sensor
+from training.estimate.estimator import models_by_sensor
 from twin.studio.state import first_state
 from twin.studio.studio import Studio, StudioPlan
 

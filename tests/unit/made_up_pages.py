@@ -118,9 +118,7 @@ def study(out: Path) -> Path:
     tables = {"models": models, "graphs": graphs, "efficiency": efficiency, "contacts": figures}
     for name, rows in tables.items():
         write_table(out / f"{name}.csv", rows)
-    columns = ["model", "seed", "state", "epochs", "leak_slope", *(f"{label}_{kind}" for kind in ("raw", "corrected") for label in LABELS)]
-    notes = {"columns": columns, "labels": "raw", "max_minutes": 30, "device": "cpu", "threads": 2}
-    return study_report.write_page(out, data, tables, notes)
+    return study_report.write_page(out, data, tables, SimpleNamespace(labels="raw", max_minutes=30), "cpu, 2 threads")
 
 
 def contact_calibration(out: Path) -> Path:

@@ -10,17 +10,18 @@ from drawn_frames import drawn_frame
 from scenes.pins import PinsSpec
 from training.data.dataset import load_dataset
 from training.errors import TrainingError
-from training.estimate.displacements import (
+from training.estimate.estimator import PoseEstimator
+from training.estimate.rest import (
     FEWEST_CONTACTS,
     FEWEST_FRAMES,
+    RestPlaces,
+    RestSeeker,
     learn_displacements,
     other_rest,
     read_displacements,
     rest_from_contacts,
     write_displacements,
 )
-from training.estimate.estimator import PoseEstimator
-from training.estimate.rest import RestPlaces, RestSeeker
 from training.studies.evaluation import at_own_rest
 from twin.errors import FrameError
 from twin.geometry.pins import pin_lattice

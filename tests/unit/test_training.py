@@ -15,8 +15,7 @@ from scenes import load_sensor
 from training.data.dataset import Dataset, join_datasets
 from training.data.pins import PinTable
 from training.errors import TrainingError
-from training.estimate.estimator import PoseEstimator
-from training.estimate.loading import digest_of, models_by_sensor
+from training.estimate.estimator import PoseEstimator, digest_of, models_by_sensor
 from training.models import recipe_of
 from training.models.part import Prediction
 from training.runs.config import changed_since, trained_before, training_rows
@@ -314,7 +313,7 @@ def test_a_runs_digest_is_that_of_its_weights_and_configuration(tmp_path, monkey
         content[-1] ^= 1
         file.write_bytes(content)
         found.append(digest_of(copy))
-    monkeypatch.setattr("training.estimate.loading.fingerprint", lambda *makers: "of another version")
+    monkeypatch.setattr("training.estimate.estimator.fingerprint", lambda *makers: "of another version")
     found.append(digest_of(copy))
     assert len(set(found)) == 5  # its displacements alone change no estimate with known rest places
 

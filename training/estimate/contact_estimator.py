@@ -44,14 +44,22 @@ COPY_AGAIN = "copy the model's folder again"
 
 @dataclass(frozen=True)
 class DisplacementModes:
-    """Principal components of displacements (M, N, 2), each of standard deviation 1: ``mean`` (2 N,) and ``components`` (2 N, K)."""
+    """Principal components of displacements (M, N, 2), ``mean`` (2 N,) and ``components`` (2 N, K)."""
 
     mean: np.ndarray
     components: np.ndarray
 
+    @classmethod
+    def of(cls, moved: np.ndarray, most: int) -> "DisplacementModes":
+        """The first of the components of displacements (M, N, 2), at most ``most``; all are scaled by the first one's deviation."""
+        flat = moved.reshape(len(moved), -1)
+        mean = flat.mean(axis=0)
+        _, sizes, directions = np.linalg.svd(flat - mean, full_matrices=False)
+        return cls(mean, directions[: min(most, len(flat) - 1)].T * np.sqrt(len(flat)) / sizes[0])
+
     def __call__(self, moved: np.ndarray) -> np.ndarray:
         """(M, K) amplitudes."""
-        return (moved.reshape(len(moved), -1) - self.mean) @ self.components
+        return (moved.reshape(len(moved), len(self.mean)) - self.mean) @ self.components
 
 
 @dataclass(frozen=True)

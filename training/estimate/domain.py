@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.spatial import KDTree
 
 from training.data.label_code import HALF_CIRCLE_DEG, label_error
 from training.errors import TrainingError
@@ -235,20 +236,17 @@ class Domain:
     _project: np.ndarray = field(init=False, repr=False, compare=False)
     _modes: np.ndarray = field(init=False, repr=False, compare=False)
     _apart: np.ndarray = field(init=False, repr=False, compare=False)
-    _sizes: np.ndarray = field(init=False, repr=False, compare=False)
-    _near: "tuple[_Nearest, _Nearest]" = field(init=False, repr=False, compare=False)
+    _near: tuple[KDTree, KDTree] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         camera, modes = np.linalg.pinv(self.motions).T, self.components * self.deviation[:, None]
         lead, labelled = self.deviation[: self.known.shape[1]], len(self.known) - self.lighter
-        for name, value in (
-            ("_project", np.concatenate([camera, self.components / self.deviation[:, None]]).T.copy()),
-            ("_modes", np.concatenate([self.motions, modes])),
-            ("_apart", _apart(self.motions, modes)),
-            ("_sizes", _sizes(len(modes))),
-            ("_near", (_Nearest(self.known), _Nearest(self.known[:labelled] * lead))),
-        ):
-            object.__setattr__(self, name, value)
+        vars(self).update(
+            _project=np.concatenate([camera, self.components / self.deviation[:, None]]).T.copy(),
+            _modes=np.concatenate([self.motions, modes]),
+            _apart=_apart(self.motions, modes),
+            _near=(KDTree(self.known), KDTree(self.known[:labelled] * lead)),
+        )
 
     def __call__(self, moved: FloatArray, lost: BoolArray | None = None) -> Strangeness:
         """The strangeness of one frame, from its pins' displacements (N, 2) in mean rest spacings; ``lost`` (N,) pins are not used."""
@@ -331,18 +329,17 @@ class Domain:
         k = int(np.argmax(excess / np.maximum(self.high - self.low, 1e-9)))
         if excess[k] <= BEYOND_RANGE * (self.high[k] - self.low[k]):
             return "", excess
-        return (
-            f"outside the trained range: {readable_labels(names)[k]} {value[k]:.3g} {units[k]}, trained from {self.low[k]:.3g} to "
-            f"{self.high[k]:.3g} {units[k]}".rstrip(),
-            excess,
-        )
+        trained = f"trained from {self.low[k]:.3g} to {self.high[k]:.3g} {units[k]}".rstrip()
+        return f"outside the trained range: {readable_labels(names)[k]} {value[k]:.3g} {units[k]}, {trained}", excess
 
     def _why(self, found: Strangeness, moved: FloatArray, lost: BoolArray, reference: Reference) -> str:
         """The most probable cause of a strange frame, in words."""
-        straight = self(_remove_similarity(moved, reference), lost)  # exactly, because the motions are those of small turns
+        spacing_px = reference.spacing_px.mean()
+        left, similarity = align(reference.pins_px[None] + moved * spacing_px, reference.pins_px)
+        straight = self(left[0] / spacing_px, lost)  # without the similarity exactly, because the motions are those of small turns
         again = "take a new frame without contact with the present view (init_0.png beside recorded frames)"
         if any((each.parts[:4] <= REFUSED).all() for each in (found, straight)):
-            scale, turn, *shift = align(reference.pins_px[None] + moved * reference.spacing_px.mean(), reference.pins_px)[1][0]
+            scale, turn, *shift = similarity[0]
             return (
                 f"displaced camera: the view is shifted by ({shift[0]:.1f}, {shift[1]:.1f}) px, turned by {np.degrees(turn):.1f} deg "
                 f"and {np.exp(scale):.3f} times as large as at rest, more than a contact does; {again}"
@@ -351,8 +348,7 @@ class Domain:
         smooth, stretch = self._smooth(moved, lost, reference)
         if share > EXPLAINS and share > smooth + TORN_MORE * (1 - smooth):
             side = ("right of x" if axis == 0 else "below y") + f" = {place:.0f} px"
-            step = step * reference.spacing_px.mean()
-            by = f"({step[0]:.1f}, {step[1]:.1f}) px"
+            by = f"({spacing_px * step[0]:.1f}, {spacing_px * step[1]:.1f}) px"
             return f"torn frame: {side} the picture is displaced by {by}; check the camera's cable and rate"
         if smooth > EXPLAINS:
             return (
@@ -396,16 +392,12 @@ class Domain:
 
     def _find_tear(self, moved: FloatArray, lost: BoolArray, reference: Reference) -> tuple[float, float, int, FloatArray]:
         """The tear that explains most: its share, its place (px), the axis across it, and the displacement (2,) beyond it in spacings."""
-        sets, places = [], []
-        for axis in (1, 0):
-            at = reference.pins_px[:, axis]
-            for place in np.quantile(at, np.linspace(0.05, 0.95, SPLITS)):
-                beyond = (at > place).astype(float)
-                sets.append([np.column_stack([beyond, 0 * beyond]).ravel(), np.column_stack([0 * beyond, beyond]).ravel()])
-                places.append((float(place), axis))
+        at, shares = reference.pins_px, np.linspace(0.05, 0.95, SPLITS)
+        cuts = [(float(place), axis) for axis in (1, 0) for place in np.quantile(at[:, axis], shares)]
+        sets = [[np.outer(at[:, axis] > place, along).ravel() for along in np.eye(2)] for place, axis in cuts]
         share, step = self._explain_misfit(moved, lost, np.array(sets))
         best = int(np.argmax(share))
-        return float(share[best]), *places[best], step[best]
+        return float(share[best]), *cuts[best], step[best]
 
     def _smooth(self, moved: FloatArray, lost: BoolArray, reference: Reference) -> tuple[float, FloatArray]:
         """Share that a stretch, tilt or distortion of the view explains, and the stretch (2,)."""
@@ -430,14 +422,14 @@ class Domain:
         camera = camera - of_camera
         wrong = (a[lead:] - further) / self.usual
         apart = self.whiten @ ((away - seen[:4] @ self.motions) @ self._apart - of_parts)
-        square = np.add.reduceat(apart * apart, np.cumsum(self._sizes) - self._sizes)
-        uneven = np.sqrt(square / self._sizes) / ample
+        sizes = _sizes(len(a))
+        uneven = np.sqrt(np.add.reduceat(apart * apart, np.cumsum(sizes) - sizes) / sizes) / ample
         misfit = float(wrong @ wrong / max(len(wrong), 1)) ** 0.5 / ample
         outside = float(left @ left / len(flat)) ** 0.5 / ample
         moved_by = float((np.abs(camera) / self.limits[7:]).max()) / ample
-        parts = np.array([outside, misfit, self._near[0](first), (uneven / self.limits[3:7]).max(), moved_by])
+        parts = np.array([outside, misfit, self._near[0].query(first)[0], (uneven / self.limits[3:7]).max(), moved_by])
         parts[:3] /= self.limits[:3]
-        unknown = self._near[1](first * self.deviation[:lead]) / len(flat) ** 0.5 - self.near
+        unknown = self._near[1].query(first * self.deviation[:lead])[0] / len(flat) ** 0.5 - self.near
         return Strangeness(parts, camera, max(unknown, 0.0), uneven, ample)
 
     def fill_lost(self, moved: FloatArray, lost: BoolArray) -> tuple[FloatArray, float]:
@@ -456,16 +448,6 @@ class Domain:
         """
         modes = self._modes[:, known]
         return modes, modes @ modes.T + NOISE**2 * np.diag(np.concatenate([np.full(4, 1e-9), np.ones(len(self.deviation))]))
-
-
-class _Nearest:
-    """Measure the distance of a point (L,) from the nearest of known ones (n, L)."""
-
-    def __init__(self, known: FloatArray) -> None:
-        self._square, self._twice = (known**2).sum(axis=1), np.ascontiguousarray(-2 * known.T)
-
-    def __call__(self, point: FloatArray) -> float:
-        return max(float((point @ self._twice + self._square).min() + point @ point), 0.0) ** 0.5
 
 
 def _terms(a: np.ndarray) -> np.ndarray:
@@ -532,10 +514,8 @@ def learn_domain(
     limits = np.quantile(measures[:, :-1], 1 - ALLOWED, axis=0)
     limits[3:7] *= np.clip(limits[3:7] / EVEN, 1.0, 1.3)
     floors = np.array([OUTSIDE, *[1.0] * 6, SHIFT, SHIFT, np.radians(TURN_DEG), SCALE])
-    unsure = [0.0]
-    if lost is not None:
-        rows = spread_indices(len(moved), LOST_FRAMES)
-        unsure = [fitted.fill_lost(moved[k], lost[k])[1] if lost[k].any() else 0.0 for k in rows]
+    lost = np.zeros(moved.shape[:2], bool) if lost is None else lost
+    unsure = [fitted.fill_lost(moved[k], lost[k])[1] if lost[k].any() else 0.0 for k in spread_indices(len(moved), LOST_FRAMES)]
     near, blind = (float(np.quantile(values, USUAL_DISTANCE)) for values in (measures[labelled, -1], unsure))
     low, high = np.quantile(labels[labelled], (1 - IN_RANGE, IN_RANGE), axis=0)
     rate = _rates(fitted, flat[labelled], labels[labelled], units, rng)
@@ -617,21 +597,14 @@ def _whitening(left: np.ndarray) -> np.ndarray:
     return np.linalg.inv(np.linalg.cholesky(square + WHITE * np.diag(np.diag(square)) + 1e-12 * np.eye(len(square))))
 
 
-def _remove_similarity(moved: FloatArray, reference: Reference) -> FloatArray:
-    """Displacements (N, 2) in spacings without the similarity of a displaced camera."""
-    spacing_px = reference.spacing_px.mean()
-    return align(reference.pins_px[None] + moved * spacing_px, reference.pins_px)[0][0] / spacing_px
-
-
 def _rates(found: Domain, flat: np.ndarray, labels: np.ndarray, units: Sequence[str], rng: np.random.Generator) -> np.ndarray:
     """Rate (K,) of each label between neighbouring frames."""
     rows = np.sort(rng.permutation(len(flat))[:KNOWN])
     lead = found.known.shape[1]
     a = ((flat[rows] - found.mean) @ found._project)[:, 4 : 4 + lead] * found.deviation[:lead] / np.sqrt(flat.shape[1])
-    apart = np.linalg.norm(a[:, None] - a, axis=2)
-    i, j = np.nonzero((apart > 0) & (np.argsort(np.argsort(apart, axis=1), axis=1) <= NEIGHBOURS))
-    change = np.abs(label_error(labels[rows][i], labels[rows][j], units))
-    return np.quantile(change / np.maximum(apart[i, j], 1e-9)[:, None], SURE_RATE, axis=0)
+    apart, near = KDTree(a).query(a, NEIGHBOURS + 1)  # the frame itself is the nearest
+    change = np.abs(label_error(labels[rows][:, None], labels[rows][near], units))
+    return np.quantile((change / np.maximum(apart, 1e-9)[..., None])[apart > 0], SURE_RATE, axis=0)
 
 
 def domain_arrays(domain: Domain) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

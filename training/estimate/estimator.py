@@ -1,6 +1,10 @@
-"""A trained model with its sensor and pipeline: it estimates the pose in a frame. A live loop calls it."""
+"""A trained model with its sensor and pipeline: it estimates the pose in a frame. A live loop calls it.
 
-from collections.abc import Iterable, Mapping
+The functions at the end load trained models: by run, by sensor, several at once.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,9 +20,8 @@ from training.data.dataset import Dataset
 from training.data.pins import PinTable
 from training.data.targets import limits_of
 from training.errors import TrainingError
-from training.estimate.displacements import DisplacementModel, read_displacements
 from training.estimate.domain import Domain, DomainVerdict, read_domain
-from training.estimate.rest import RestPlaces, RestSeeker
+from training.estimate.rest import DisplacementModel, RestPlaces, RestSeeker, read_displacements
 from training.estimate.widening import Widening
 from training.models import model_named
 from training.models.part import Inputs, OneFrame, PinModel, Prediction, Trained, Unseen
@@ -33,6 +36,7 @@ from twin.estimate import SensorModel
 from twin.frames.forms import blob_spec, form_named
 from twin.mechanics.skin_map import ContactMaps
 from twin.pins import Pipeline, Reference, make_reference
+from twin.store import fingerprint
 from twin.types import Form, Frame, Observation
 
 USUAL_FRAME = DomainVerdict("")
@@ -408,7 +412,7 @@ class PoseEstimator:
         if slip is not None:
             value, low, high = (np.concatenate(pair) for pair in zip((value, low, high), slip.values, strict=True))
         head = self.names, self.units, value, low, high, executed
-        return PoseEstimate(*head, True, "", _ms(started), contact, made.touched, notes, made.seen)
+        return PoseEstimate(*head, True, "", 1e3 * (perf_counter() - started), contact, made.touched, notes, made.seen)
 
     def pins_in(self, frame: Frame) -> OneFrame | Unseen:
         """The pins of one frame, or the reason why they can't be used; raises as a call does."""
@@ -469,7 +473,7 @@ class PoseEstimator:
             self._tracker.forget()
         none = np.full(len(self.names), np.nan)
         head = self.names, self.units, none, none, none, np.nan
-        return PoseEstimate(*head, False, seen.reason, _ms(started), contact, seen.touched, seen=seen.seen)
+        return PoseEstimate(*head, False, seen.reason, 1e3 * (perf_counter() - started), contact, seen.touched, seen=seen.seen)
 
     def predict_rows(self, data: Dataset, rows: np.ndarray) -> Prediction:
         """Estimate the labels of some rows (B,) of a data set whose frames are all of one camera.
@@ -515,5 +519,65 @@ class PoseEstimator:
         return self.part
 
 
-def _ms(started: float) -> float:
-    return 1e3 * (perf_counter() - started)
+def models_by_sensor(run: str | Path | None = None, first: str = "") -> Callable[[str], PoseEstimator | None]:
+    """A function from a sensor's name to a trained model of it: that of a run, else the shipped one, else None.
+
+    After the first model is loaded, the networks of this process run in one thread: for networks of this size, more threads cost more time
+    than they save.
+
+    Parameters
+    ----------
+    run : path, optional
+    first : str
+        Name of the sensor to which the run must belong; "" for any.
+
+    Raises
+    ------
+    TrainingError
+        The run holds no trained model, or one of another sensor than ``first``.
+    """
+    given = None if run is None else PoseEstimator.load(run)
+    if given is not None and first not in ("", given.sensor.name):
+        raise TrainingError(f"{run}: a model of '{given.sensor.name}', not of '{first}'; give its --sensor, or another --model")
+
+    def model_of(sensor: str) -> PoseEstimator | None:
+        torch.set_num_threads(1)
+        if given is not None and given.sensor.name == sensor:
+            return given
+        return PoseEstimator.load(sensor) if sensor in run_files.shipped_names() else None
+
+    return model_of
+
+
+def digest_of(run: str | Path) -> str:
+    """Digest of everything that affects a model's estimates: its weights, its configuration, and the code that runs it."""
+    folder, digest = run_files.folder_of(run), hashlib.sha256(fingerprint(PoseEstimator).encode())
+    for name in (run_files.CONFIG, run_files.WEIGHTS, run_files.TENSORS, run_files.DOMAIN):
+        if (folder / name).is_file():
+            digest.update(name.encode() + hashlib.sha256((folder / name).read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def load_with_history(run: str | Path) -> PoseEstimator:
+    """A trained model for consecutive frames: ``PoseEstimator.load`` and ``PoseEstimator.with_history``.
+
+    Raises
+    ------
+    TrainingError
+        The folder holds no run.
+    """
+    return PoseEstimator.load(run).with_history()
+
+
+def load_by_name(runs: Sequence[Path]) -> dict[str, PoseEstimator]:
+    """Load several trained models. The keys are the names of their folders, or their whole paths if two folders have the same name.
+
+    Raises
+    ------
+    TrainingError
+        A folder holds no run.
+    """
+    names = [run.name for run in runs]
+    if len(set(names)) < len(names):
+        names = [str(run) for run in runs]
+    return {name: PoseEstimator.load(run) for name, run in zip(names, runs, strict=True)}

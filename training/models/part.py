@@ -21,8 +21,7 @@ from training.data.dataset import Dataset
 from training.data.label_code import LabelCode
 from training.data.pins import PinTable, cap_light
 from training.errors import TrainingError
-from twin.pins import Pipeline
-from twin.pins.labelling.reference import Reference
+from twin.pins import Pipeline, Reference
 from twin.types import Frame, Observation
 
 LIKELY = 0.5  # least probability of a contact for which a frame gets an estimate
@@ -418,7 +417,7 @@ class PinModel(Model):
 
     def estimate_one(self, trained: Trained, seen: OneFrame) -> Prediction:
         """Estimate the labels of one frame."""
-        return replace(self._estimate_table(trained, seen.pins, together=False), touched=seen.touched, seen=seen.seen)
+        return replace(self.estimate_pins(trained, seen.pins), touched=seen.touched, seen=seen.seen)
 
     def estimate_rows(self, trained: Trained, data: Dataset, rows: np.ndarray) -> Prediction:
         """See ``Model``."""
@@ -430,10 +429,7 @@ class PinModel(Model):
         If the camera sits at another place than in training, its displacement is measured in the table's own frame without contact. Without
         such a frame it is the median over the frames.
         """
-        return self._estimate_table(trained, pins, together=not pins.measured)
-
-    def _estimate_table(self, trained: Trained, pins: PinTable, *, together: bool) -> Prediction:
-        inputs = self.inputs(pins, trained.learnt, trained.reference, together=together)
+        inputs = self.inputs(pins, trained.learnt, trained.reference, together=not pins.measured)
         return trained.ensemble(inputs, torch.arange(len(pins)))
 
 

@@ -87,7 +87,7 @@ def run(plan: DegradationPlan, out: Path, *, progress: Progress = silent) -> Deg
     check_pipelines(pipelines, tuple(each.name for each in runs))
     settings = SweepSettings(rendered, (), plan.sweep.cases(), plan.sweep.severities())
     if runs:
-        from training.estimate.loading import digest_of
+        from training.estimate.estimator import digest_of
 
         load_models(runs, plan.sensor)  # each worker process loads its own; loading here reports an error once, before the work starts
         models, digests = partial(load_models, runs, plan.sensor), {each.name: digest_of(each) for each in runs}

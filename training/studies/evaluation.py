@@ -14,8 +14,8 @@ from training.data.dataset import Dataset, join_datasets, load_dataset
 from training.data.simulated import is_simulated
 from training.errors import TrainingError
 from training.estimate.contact_estimator import ContactEstimator, contacts_folder
-from training.estimate.displacements import MOST_CONTACTS, OTHER_UNIT
 from training.estimate.estimator import PoseEstimate, PoseEstimator
+from training.estimate.rest import MOST_CONTACTS, OTHER_UNIT
 from training.runs.config import changed_since, trained_before
 from training.runs.run_files import folder_of
 from training.studies.judging import measure_changes, measure_errors, rows_to_evaluate, time_frames, write_evaluation
@@ -131,14 +131,10 @@ class Evaluation(ReadableResult):
         labels = dict(zip(self.units, readable_labels(tuple(self.units)), strict=True))
         for name, label in labels.items():
             unit, raw, corrected = self.units[name], self.metrics["raw"][name], self.metrics["corrected"][name]
-            if raw == corrected:
-                inside = f"{100 * raw['coverage_90']:.1f} % inside the 90 % intervals"
-                lines.append(f"{label}: mean error {raw['mae']:.4g} {unit}; {inside}")
-                continue
-            lines.append(
-                f"{label}: mean error {corrected['mae']:.4g} {unit} against corrected labels, {raw['mae']:.4g} against raw; "
-                f"{100 * corrected['coverage_90']:.1f} % and {100 * raw['coverage_90']:.1f} % inside the 90 % intervals for them"
-            )
+            against = "" if raw == corrected else f" against corrected labels, {raw['mae']:.4g} against raw"
+            inside = " and ".join(f"{100 * kind['coverage_90']:.1f} %" for kind in ([corrected, raw] if against else [raw]))
+            inside += f" inside the 90 % intervals{' for them' if against else ''}"
+            lines.append(f"{label}: mean error {corrected['mae']:.4g} {unit}{against}; {inside}")
         if taken := self.metrics.get("taken_for"):
             lines.append("taken for " + ", ".join(f"{kind} {100 * share:.1f} %" for kind, share in taken.items()))
         if maps := self.metrics.get("maps"):
@@ -221,10 +217,8 @@ def evaluate_run(
             parts.append(at_own_rest(estimator, part))
     found = join_datasets(parts)
     chosen = rows_to_evaluate(estimator, found, rows)
-    if rows == "validation":
-        found.problems.extend(changed_since(estimator.config, found, estimator.part))
-    else:
-        found.problems.extend(trained_before(estimator.learnt_from, found))
+    notes = trained_before(estimator.learnt_from, found) if rows == "all" else changed_since(estimator.config, found, estimator.part)
+    found.problems.extend(notes)
     made = several.predict_rows(found, chosen, kinds) if several else estimator.predict_rows(found, chosen)
     metrics = {"model": estimator.model, "rows": rows, **measure_errors(made, found, chosen)}
     metrics["ms_per_frame"] = time_frames(several or estimator, found)
@@ -412,9 +406,7 @@ def _draw_over(axes: Axes, image: ImageArray, maps: ContactMaps, nodes_px: Float
     way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
     shear = np.linalg.norm(maps.traction_mpa, axis=1)
     length = shear / max(float(shear.max()), 1e-9) * ARROW_SHARE * width
-    chosen = np.zeros(pressure.shape, bool)
-    chosen[::ARROW_EVERY, ::ARROW_EVERY] = True
-    chosen = chosen.ravel() & (maps.pressure_mpa >= SHOWN_SHARE * largest)
+    chosen = (np.indices(pressure.shape) % ARROW_EVERY == 0).all(axis=0).ravel() & (maps.pressure_mpa >= SHOWN_SHARE * largest)
     at, arrow = nodes_px[chosen], (way * length[:, None])[chosen]
     axes.quiver(*at.T, *arrow.T, angles="xy", scale_units="xy", scale=1, color="white", width=0.004)
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), title="over the frame; arrows: shear on the object")

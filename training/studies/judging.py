@@ -6,8 +6,9 @@ displaced in a random direction, or pins are removed. The result is the increase
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from time import perf_counter
+from timeit import timeit
 from typing import Any
 
 import cv2
@@ -23,7 +24,7 @@ from training.estimate.estimator import PoseEstimator
 from training.models.part import Prediction
 from training.runs.config import rows_named
 from twin.estimate import readable_labels
-from twin.frames import open_recording
+from twin.frames import evenly_read, open_recording
 from twin.progress import Step, unheard
 from twin.report.charts import new_figure, save_figure
 from twin.report.page import write_table
@@ -164,16 +165,11 @@ def time_frames(estimator: Callable[[Frame], object], data: Dataset) -> float | 
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        frames = [recording.read(k) for k in np.linspace(0, len(recording) - 1, min(TIMED_FRAMES, len(recording))).astype(int)]
+        frames = evenly_read(recording, TIMED_FRAMES)
         estimator(frames[0])
-        taken = []
-        for frame in frames:
-            started = perf_counter()
-            estimator(frame)
-            taken.append(1e3 * (perf_counter() - started))
+        return 1e3 * float(np.median([timeit(partial(estimator, frame), number=1) for frame in frames]))
     finally:
         torch.set_num_threads(threads)
-    return float(np.median(taken))
 
 
 def write_evaluation(out: Path, made: Prediction, data: Dataset, rows: np.ndarray, metrics: dict, labels: str) -> list[Path]:
@@ -232,8 +228,8 @@ def erase_pins(image: np.ndarray, rng: np.random.Generator, estimator: PoseEstim
     image = image.copy()
     background = int(np.median(image)) if estimator.form == Form.RAW else 0
     for pin in rng.choice(found, min(ERASED_PINS, len(found)), replace=False):
-        low, high = np.maximum(np.round(seen.pins_px[pin] - half), 0).astype(int), np.round(seen.pins_px[pin] + half).astype(int)
-        image[low[1] : high[1] + 1, low[0] : high[0] + 1] = background
+        low, high = np.round(seen.pins_px[pin] + [[-half], [half]]).astype(int).tolist()
+        cv2.rectangle(image, low, high, [background] * 3, cv2.FILLED)
     return image
 
 
@@ -246,9 +242,7 @@ CHANGES: dict[str, Change] = {
 }
 
 
-def measure_changes(
-    estimator: PoseEstimator, data: Dataset, rows: np.ndarray, *, seed: int = 0, progress: Step = unheard
-) -> list[dict[str, Any]]:
+def measure_changes(estimator: PoseEstimator, data: Dataset, rows: np.ndarray, *, progress: Step = unheard) -> list[dict[str, Any]]:
     """Errors against corrected labels of single frames, unchanged and under every change.
 
     Returns
@@ -267,7 +261,7 @@ def measure_changes(
     recording = open_recording(data.folder, data.pins.sensor, data.pins.form)
     place = {name: k for k, name in enumerate(recording.names)}
     changes: dict[str, Change] = {"none": lambda image, rng, estimator: image} | CHANGES
-    rngs = {name: np.random.default_rng([seed, k]) for k, name in enumerate(changes)}
+    rngs = {name: np.random.default_rng([0, k]) for k, name in enumerate(changes)}
     value = {name: np.full((len(rows), len(estimator.names)), np.nan) for name in changes}
     for m, row in enumerate(rows):
         frame = recording.read(place[data.pins.image_name[row]])

@@ -58,8 +58,7 @@ class LabelAudit(ReadableResult):
             lines = [f"frames: {self.frames}; in {undone['frames']} the move was not executed; {undecided} undecided"]
         for key in (*LISTS, "reader"):
             if names := self.summary[key]:
-                more = ", ..." if len(names) > SAID else ""
-                lines.append(f"{key.replace('_', ' ')}: {len(names)} ({', '.join(names[:SAID])}{more})")
+                lines.append(f"{key.replace('_', ' ')}: {len(names)} ({_some(names, SAID)})")
         if self.audit.not_assessed:
             return lines
         drift = self.audit.drift["r2_of_row_number_beyond_labels"]
@@ -147,27 +146,24 @@ def write_audit(out: Path, audit: Audit, data: Dataset, summary: dict) -> list[P
     )
     page.notice("Not assessed, and no corrected labels written", [audit.not_assessed] if audit.not_assessed else [], tone="bad")
     page.notice("Notes on the recording", summary["reader"])
-    evidence = [] if audit.not_assessed else _write_evidence(out, audit, data, page)
+    tables, charts = list[Path](), list[Path]()
+    if not audit.not_assessed:
+        labels = _correct_moves(data, audit.executed.round(), audit.depth_per_move)
+        tables = [write_table(out / "labels_corrected.csv", _label_rows(audit, data, labels))]
+        charts = [write_chart(out / "audit.png", lambda: _evidence_figure(audit, data, labels))]
+        shown = "Evidence for the findings: which hypothesis fits each frame, corrections of the angle, moves along the table, drift"
+        page.figures(PagePicture(charts[0], shown))
     page.section("Findings")
     page.table(_findings(summary), [Column("finding", "finding"), Column("value", "value", align="right")])
     page.section("Frames that stand out")
     page.table(
-        [{"finding": key.replace("_", " "), "count": len(summary[key]), "frames": _some(summary[key])} for key in LISTS],
+        [{"finding": key.replace("_", " "), "count": len(summary[key]), "frames": _some(summary[key], NAMED)} for key in LISTS],
         [Column("finding", "finding"), Column("count", "frames"), Column("frames", "which")],
     )
-    for table in evidence[:1]:
+    for table in tables:
         page.download(table, "corrected labels, and the findings of each frame")
     page.download(numbers, "all findings, with the names of all frames")
-    return [*evidence[:1], numbers, *evidence[1:], page.write(out / "audit.html")]
-
-
-def _write_evidence(out: Path, audit: Audit, data: Dataset, page: Page) -> list[Path]:
-    """Write the corrected labels and the picture, and show the picture on the page."""
-    labels = _correct_moves(data, audit.executed.round(), audit.depth_per_move)
-    chart = write_chart(out / "audit.png", lambda: _evidence_figure(audit, data, labels))
-    shown = "Evidence for the findings: which hypothesis fits each frame, corrections of the angle, moves along the table, drift"
-    page.figures(PagePicture(chart, shown))
-    return [write_table(out / "labels_corrected.csv", _label_rows(audit, data, labels)), chart]
+    return [*tables, numbers, *charts, page.write(out / "audit.html")]
 
 
 def _findings(group: dict, within: str = "") -> list[dict]:
@@ -182,8 +178,8 @@ def _findings(group: dict, within: str = "") -> list[dict]:
     return rows
 
 
-def _some(names: list[str]) -> str:
-    return f"{', '.join(names[:NAMED])}{', ...' if len(names) > NAMED else ''}" or "none"
+def _some(names: list[str], most: int) -> str:
+    return f"{', '.join(names[:most])}{', ...' if len(names) > most else ''}" or "none"
 
 
 def _label_rows(audit: Audit, data: Dataset, labels: dict[str, np.ndarray]) -> list[dict[str, object]]:

@@ -89,9 +89,8 @@ class ObjectsPlan:
 
     def sets(self) -> list[tuple[str, GenerationConfig, int]]:
         """Folder, configuration and number of contacts of every data set."""
-        learnt = [
-            (f"sim/{o.name}", self._config(o, self.wider, 0), self.count * (len(self.train) if o is self.alone else 1)) for o in self.train
-        ]
+        many = self.count * len(self.train)
+        learnt = [(f"sim/{o.name}", self._config(o, self.wider, 0), many if o is self.alone else self.count) for o in self.train]
         tests = [(f"tests/{o.name}", self._config(o, self.experiment, TESTS_APART), self.tests) for o in (*self.train, *self.unseen)]
         return learnt + tests
 
@@ -264,9 +263,8 @@ def errors_figure(rows: Sequence[Mapping], names: Sequence[str], alone: str) -> 
     figure, axes = sized_figure((4.4 * len(names) + 1.0, 0.34 * len(objects) + 1.3), len(names))
     for panel, (ax, name) in enumerate(zip(axes, names, strict=True)):
         for model, color, mark, above in ((MIXED, BLUE, "o", 0.12), (alone, RED, "s", -0.12)):
-            mine = [row for row in rows if row["model"] == model]
             for seen in (True, False):
-                part = [row for row in mine if bool(row["seen"]) is seen]
+                part = [row for row in rows if row["model"] == model and bool(row["seen"]) is seen]
                 places = [len(objects) - 1 - objects.index(row["object"]) + above for row in part]
                 label = f"trained on {'several objects' if model == MIXED else model}" if seen else None
                 ax.plot([row[f"{name}_times"] for row in part], places, mark, color=color, mfc=color if seen else "none", label=label)

@@ -11,12 +11,11 @@ from scenes import SensorSpec
 from training.data.dataset import Dataset, join_datasets, load_dataset, with_common_labels
 from training.data.simulated import is_simulated
 from training.data.targets import CONTACT, PRESETS, SHEAR, TURN
-from training.estimate.displacements import learn_displacements, write_displacements
 from training.estimate.domain import learn_domain, write_domain
 from training.estimate.estimator import PoseEstimator
-from training.models import model_named, recipe_of
+from training.estimate.rest import learn_displacements, write_displacements
+from training.models import TOUCH, model_named, recipe_of
 from training.models.part import LIKELY
-from training.models.touch.model import TOUCH
 from training.runs.config import RunConfig, training_labels, training_rows
 from training.runs.loop import choose_device
 from training.runs.run import RUN_FILES, train_run

@@ -115,10 +115,8 @@ class Drag:
         sliding = np.flatnonzero(self.share >= WHOLE)
         if not len(sliding):
             return float("nan")
-        k = int(sliding[0])
-        before, after = (self.share[k - 1], self.share[k]) if k else (WHOLE, WHOLE)
-        part = (WHOLE - before) / (after - before) if after > before else 1.0
-        return float(self.drag_mm[k] if not k else self.drag_mm[k - 1] + part * (self.drag_mm[k] - self.drag_mm[k - 1]))
+        around = [max(sliding[0] - 1, 0), sliding[0]]
+        return float(np.interp(WHOLE, self.share[around], self.drag_mm[around]))
 
 
 @dataclass(frozen=True)
@@ -526,8 +524,5 @@ def compare_slip(model: SlipModel, paths: Sequence[DragPath]) -> dict[str, float
     found["late"] = [lead < 0 for lead in found["lead_mm"]]
     counts = {"contacts": len(paths), "frames": len(found["whole_accuracy"])}
     direction_deg = float(np.median(turned)) if turned else float("nan")
-    return counts | {name: _mean(values) for name, values in found.items()} | {"direction_deg": direction_deg}
-
-
-def _mean(values: Sequence[float]) -> float:
-    return float(np.mean(values)) if values else float("nan")
+    means = {name: float(np.mean(values)) if values else float("nan") for name, values in found.items()}
+    return counts | means | {"direction_deg": direction_deg}

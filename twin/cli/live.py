@@ -86,7 +86,7 @@ def live(
       twin live --replay out/session --model RUN --headless
     """
     from hardware.live.live import WatchPlan, watch
-    from training.estimate.loading import load_with_history
+    from training.estimate.estimator import load_with_history
 
     plan = call(WatchPlan, locals(), shown=not headless)
     with signals_as_ctrl_c():
@@ -212,7 +212,7 @@ def servo(
     The exit code is 1 if it ended early.
     """
     from hardware.servo.following import FollowPlan, follow
-    from training.estimate.loading import load_with_history
+    from training.estimate.estimator import load_with_history
 
     stream_hz = rate if stream else None
     plan = call(FollowPlan, locals())

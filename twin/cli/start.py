@@ -258,6 +258,6 @@ def lazy_models_by_sensor(run: Path | None, sensor: str) -> Callable[[str], "Pos
     """``models_by_sensor``. If no run is given, it loads when the first model is requested, so that the page does not wait for PyTorch."""
 
     def model_of(name: str) -> "PoseEstimator | None":
-        return library("training.estimate.loading").models_by_sensor()(name)
+        return library("training.estimate.estimator").models_by_sensor()(name)
 
-    return model_of if run is None else library("training.estimate.loading").models_by_sensor(run, sensor)
+    return model_of if run is None else library("training.estimate.estimator").models_by_sensor(run, sensor)

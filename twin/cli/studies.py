@@ -50,7 +50,7 @@ def study_servo_command(
     Writes to --out: a folder for each model and object as 'twin servo' writes it, index.html, study.csv, study.png.
     """
     from hardware.servo.following import ServoStudyPlan, study_servo
-    from training.estimate.loading import load_by_name
+    from training.estimate.estimator import load_by_name
 
     return study_servo(call(ServoStudyPlan, locals(), models=load_by_name(models)), out, progress=progress)
 

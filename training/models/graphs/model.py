@@ -20,8 +20,7 @@ from torch import nn
 from training.data.pins import PinTable
 from training.models.part import Learnt, PinModel, Recipe, refuse_sizes
 from twin.frames.forms import frame_size
-from twin.pins import make_graph
-from twin.pins.labelling.reference import Reference
+from twin.pins import Reference, make_graph
 
 CHANNELS = (16, 32, 48, 64, 96)
 DENSE = {"paper": (96, 64), "release": (128, 96)}
@@ -31,11 +30,11 @@ SLOPE = 0.01
 RELEASE_PX = 300.0
 
 
-def graph_rows(edges: list[np.ndarray], nodes: int, *, transposed: bool = False) -> csr_array:
-    """Normalised adjacency (M N, N) of M graphs of ``nodes`` nodes, one below the other, or its transposes.
+def graph_rows(edges: list[np.ndarray], nodes: int) -> csr_array:
+    """Normalised adjacency (M N, N) of M graphs of ``nodes`` nodes, one below the other.
 
-    A row holds the in-edges of a node (``transposed``: its out-edges) with the weights ``1 / sqrt(d_i d_j)``, d being the in-degree
-    including the loop that is added to every node.
+    A row holds the in-edges of a node with the weights ``1 / sqrt(d_i d_j)``, d being the in-degree including the loop that is added to
+    every node.
 
     Parameters
     ----------
@@ -47,87 +46,36 @@ def graph_rows(edges: list[np.ndarray], nodes: int, *, transposed: bool = False)
     source, target = (np.concatenate([ends, loop]) for ends in every.T)
     degree = np.bincount(target)
     weight = (1 / np.sqrt(degree[source] * degree[target])).astype(np.float32)
-    row, column = (source, target) if transposed else (target, source)
-    return csr_array((weight, (row, column % nodes)), shape=(len(loop), nodes))
+    return csr_array((weight, (target, source % nodes)), shape=(len(loop), nodes))
 
 
-def block_diagonal(rows: csr_array, chosen: np.ndarray) -> torch.Tensor:
-    """The block diagonal matrix (B N, B N) of some of the graphs (B,) of ``graph_rows``, as sparse rows."""
+def block_diagonal(rows: csr_array, chosen: np.ndarray) -> tuple[torch.Tensor, ...]:
+    """The block diagonal matrix (B N, B N) of some of the graphs (B,) of ``graph_rows``, and its transpose, both as sparse rows."""
     nodes = rows.shape[1]
     start = nodes * np.arange(len(chosen))
     found = rows[(nodes * chosen[:, None] + np.arange(nodes)).ravel()]
     column = found.indices + np.repeat(start, np.diff(found.indptr[np.append(start, len(start) * nodes)]))
-    indptr, column, weight = (torch.from_numpy(values) for values in (found.indptr.astype(np.int32), column.astype(np.int32), found.data))
-    size = (len(start) * nodes,) * 2
+    matrix = csr_array((found.data, column, found.indptr), shape=(len(start) * nodes,) * 2)
+    both = matrix, matrix.T.tocsr()
+    parts: list[Any] = [map(torch.from_numpy, (each.indptr.astype(np.int32), each.indices.astype(np.int32), each.data)) for each in both]
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sparse CSR")  # "in beta state", said once
-        return torch.sparse_csr_tensor(indptr, column, weight, size, check_invariants=False)
+        return tuple(torch.sparse_csr_tensor(ends, column, weight, matrix.shape, check_invariants=False) for ends, column, weight in parts)
 
 
-class GraphConvolution(torch.autograd.Function):
-    """``leaky_relu(batch_norm(A h W^T))`` in training, with the statistics of the batch (Ioffe and Szegedy 2015).
-
-    The statistics of the norm follow from the mean m and the covariance S of ``a = A h``: output channel c has the mean ``W_c m`` and
-    the variance ``W_c S W_c^T``. With these the norm is linear. Therefore norm and weights are one product with ``K W``,
-    ``K = diag(gain / deviation)``, and no pass over the wider output is needed. A bias before the norm would cancel, so there is none.
-    ``backward`` is the derivative of the same formulas and uses the transpose of A.
-    """
+class NeighbourMean(torch.autograd.Function):
+    """Product A h of a sparse matrix (V, V) and nodes (V, C). PyTorch's own derivative would transpose A for every batch."""
 
     @staticmethod
-    def forward(
-        ctx: Any,  # PyTorch declares no type for an object with these attributes
-        matrix: torch.Tensor,
-        transpose: torch.Tensor,
-        h: torch.Tensor,
-        weight: torch.Tensor,
-        gain: torch.Tensor,
-        offset: torch.Tensor,
-        eps: float,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Activations (V, D) of the nodes of all graphs, and mean and variance (D,) of the norm's inputs.
-
-        Parameters
-        ----------
-        matrix, transpose : (V, V) sparse rows
-            A and its transpose.
-        h : (V, C) float
-        weight : (D, C) float
-        gain, offset : (D,) float
-            Parameters of the norm.
-        eps : float
-            Added to the variance, so that a constant channel does not lead to a division by 0.
-        """
-        around = _product(matrix, h)
-        mean = around.mean(dim=0)
-        around.sub_(mean)
-        spread = weight @ (around.T @ around).div_(len(around))  # W S
-        variance = (spread * weight).sum(dim=1)
-        inverse = (variance + eps).rsqrt()
-        out = torch.addmm(offset, around, ((gain * inverse)[:, None] * weight).T)
-        out = nn.functional.leaky_relu_(out, SLOPE)
+    def forward(ctx: Any, matrix: torch.Tensor, transpose: torch.Tensor, h: torch.Tensor) -> torch.Tensor:
+        """The product; ``transpose`` is the transpose of ``matrix``."""
         ctx.transpose = transpose
-        ctx.save_for_backward(around, out, weight, gain, spread, inverse)
-        mean = weight @ mean
-        ctx.mark_non_differentiable(mean, variance)
-        return out, mean, variance
+        return _product(matrix, h)
 
     @staticmethod
-    def backward(ctx: Any, gradient: torch.Tensor, *_: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        """Derivatives with respect to the arguments of ``forward``, from those with respect to its activations (V, D)."""
-        around, out, weight, gain, spread, inverse = ctx.saved_tensors
-        size = gain * inverse
-        of_norm = torch.ops.aten.leaky_relu_backward(gradient, out, SLOPE, True)  # derivatives by the norm's output
-        of_offset = (of_norm.new_ones(1, len(of_norm)) @ of_norm)[0]
-        pull = of_norm.T @ around
-        of_gain = (pull * weight).sum(dim=1) * inverse
-        of_weight = size[:, None] * (pull - (of_gain * inverse)[:, None] * spread)
-        of_h = None
-        if ctx.needs_input_grad[2]:
-            share = size * of_gain * inverse / len(out)
-            of_around = torch.addmm(-(size * of_offset / len(out)) @ weight, of_norm, size[:, None] * weight)
-            of_around.addmm_(around, weight.T @ (share[:, None] * weight), alpha=-1)
-            of_h = _product(ctx.transpose, of_around)
-        return None, None, of_h, of_weight, of_gain, of_offset, None
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[None, None, torch.Tensor | None]:
+        """Derivatives with respect to the arguments of ``forward``."""
+        return None, None, _product(ctx.transpose, gradient) if ctx.needs_input_grad[2] else None
 
 
 def _product(matrix: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
@@ -178,18 +126,8 @@ class Gcn(nn.Module):
         """
         graphs, nodes = x.shape[:2]
         h = x.reshape(graphs * nodes, -1)
-        for layer, norm in zip(cast(list[nn.Linear], self.convolutions), cast(list[nn.BatchNorm1d], self.norms), strict=True):
-            running_mean, running_var = cast(torch.Tensor, norm.running_mean), cast(torch.Tensor, norm.running_var)
-            if not self.training:
-                size = norm.weight * (running_var + norm.eps).rsqrt()
-                out = torch.addmm(norm.bias - size * running_mean, matrix @ h, (size[:, None] * layer.weight).T)
-                h = nn.functional.leaky_relu_(out, SLOPE)
-                continue
-            h, mean, variance = GraphConvolution.apply(matrix, transpose, h, layer.weight, norm.weight, norm.bias, norm.eps)
-            with torch.no_grad():
-                momentum = cast(float, norm.momentum)
-                running_mean.lerp_(mean, momentum)
-                running_var.lerp_(variance * (len(h) / max(len(h) - 1, 1)), momentum)
+        for layer, norm in zip(self.convolutions, self.norms, strict=True):
+            h = nn.functional.leaky_relu_(norm(layer(NeighbourMean.apply(matrix, transpose, h))), SLOPE)
         return {"mean": self.dense(h.view(graphs, nodes, -1).mean(dim=1))}
 
 
@@ -201,23 +139,17 @@ class GraphInputs:
     features : (M, N, F) float
     edges : list of (E_k, 2) int arrays
         Directed edges of each of M graphs.
-    symmetric : bool
-        Whether every edge is given in both directions.
     """
 
-    def __init__(self, features: np.ndarray, edges: list[np.ndarray], *, symmetric: bool) -> None:
-        self.x = torch.from_numpy(features.astype(np.float32))
-        self.forward = graph_rows(edges, features.shape[1])
-        self.back = self.forward if symmetric else graph_rows(edges, features.shape[1], transposed=True)
+    def __init__(self, features: np.ndarray, edges: list[np.ndarray]) -> None:
+        self.x, self.rows = torch.from_numpy(features.astype(np.float32)), graph_rows(edges, features.shape[1])
 
     def __len__(self) -> int:
         return len(self.x)
 
     def batch(self, rows: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Arguments of the network for some rows."""
-        chosen = rows.numpy()
-        matrix = block_diagonal(self.forward, chosen)
-        return self.x[rows], matrix, matrix if self.back is self.forward else block_diagonal(self.back, chosen)
+        return self.x[rows], *block_diagonal(self.rows, rows.numpy())
 
 
 def pixel_features(nodes_px: np.ndarray, area_px2: np.ndarray | None, width_px: int) -> np.ndarray:
@@ -245,18 +177,14 @@ class GraphModel(PinModel):
     def build(self, reference: Reference, outputs: int, size: Mapping[str, int]) -> Gcn:
         """See ``Model``; there are no sizes."""
         refuse_sizes(self, size)
-        return Gcn(3 if self._sees_areas else 2, outputs, self.dense)
+        return Gcn(3 if self.edges == "delaunay" else 2, outputs, self.dense)
 
     def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> GraphInputs:
         """See ``PinModel``. Nothing is learnt before training, and the camera's place is not corrected."""
         width_px = frame_size(pins.sensor, pins.form)[0]
-        features = pixel_features(pins.nodes_px, pins.area_px2 if self._sees_areas else None, width_px)
+        features = pixel_features(pins.nodes_px, pins.area_px2 if self.edges == "delaunay" else None, width_px)
         edges = [make_graph(self.edges, nodes_px).edges for nodes_px in pins.nodes_px]
-        return GraphInputs(features, edges, symmetric=self._sees_areas)
-
-    @property
-    def _sees_areas(self) -> bool:
-        return self.edges == "delaunay"
+        return GraphInputs(features, edges)
 
 
 # Settings that the paper does not state are those of the published code, with two changes: the batches are smaller, so that there are

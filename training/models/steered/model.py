@@ -18,11 +18,11 @@ exp(i t) u(r, p - t), and therefore the coefficients c_mn exp(i t (1 - m)).
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from math import factorial
 from typing import cast
 
 import numpy as np
 import torch
+from scipy.special import eval_jacobi
 from torch import nn
 
 from training.data.label_code import LabelCode
@@ -74,19 +74,12 @@ def waves_of(rest_px: np.ndarray) -> Waves:
         degree += 1
     parts, order = [], []
     for m in range(-degree, degree + 1):
-        radial = np.stack([_radial(n, abs(m), np.abs(place)) for n in range(abs(m), degree + 1, 2)], axis=1)
-        smooth, _ = np.linalg.qr(radial * np.exp(1j * m * np.angle(place))[:, None])
+        count = (degree - abs(m)) // 2 + 1  # R_mn is r^m times a polynomial of Jacobi
+        radial = np.abs(place) ** abs(m) * [eval_jacobi(k, abs(m), 0, 1 - 2 * np.abs(place) ** 2) * (-1) ** k for k in range(count)]
+        smooth, _ = np.linalg.qr((radial * np.exp(1j * m * np.angle(place))).T)
         parts.append(smooth)
         order += [1 - m] * smooth.shape[1]
     return Waves(np.linalg.pinv(np.concatenate(parts, axis=1)), np.array(order))
-
-
-def _radial(n: int, m: int, r: np.ndarray) -> np.ndarray:
-    total = np.zeros_like(r)
-    for k in range((n - m) // 2 + 1):
-        size = factorial(n - k) / (factorial(k) * factorial((n + m) // 2 - k) * factorial((n - m) // 2 - k))
-        total += (-1) ** k * size * r ** (n - 2 * k)
-    return total
 
 
 @dataclass(frozen=True)
@@ -185,10 +178,8 @@ class Steered(nn.Module):
         sine = int(np.flatnonzero(np.repeat(code.circular, np.where(code.circular, 2, 1)))[0])
         self.sine.fill_(sine)
         seen, direction = self.coefficients(moved), torch.atan2(numbers[:, sine], numbers[:, sine + 1])
-        alike = [
-            float(self.turn_coefficients(seen, -sense * direction)[:, self.order != 0].mean(dim=0).abs().square().sum())
-            for sense in (1, -1)
-        ]
+        turned = [self.turn_coefficients(seen, -sense * direction)[:, self.order != 0] for sense in (1, -1)]
+        alike = [float(each.mean(dim=0).abs().square().sum()) for each in turned]
         self.sense.fill_(1.0 if alike[0] >= alike[1] else -1.0)
         copies = seen.repeat(COPIES, 1)
         self.first.prepare(self.turn_coefficients(copies, 2 * torch.pi * torch.rand(len(copies))))
@@ -282,10 +273,8 @@ class SteeredModel(PinModel):
         TrainingError
             Not exactly one label goes round the whole circle.
         """
-        if sum(code.circular) != 1:
-            raise TrainingError(
-                f"{self.name} is for labels of which one is a direction on the whole circle, these have {sum(code.circular)}; train vgnn"
-            )
+        if (many := sum(code.circular)) != 1:
+            raise TrainingError(f"{self.name} is for labels of which one is a direction on the whole circle, these have {many}; train vgnn")
         cast(Steered, network).prepare(inputs.batch(rows)[0], numbers[rows], code)
 
     def modes(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor) -> Modes:

@@ -88,12 +88,8 @@ class Bases:
     def __call__(self, moved: np.ndarray, light: np.ndarray) -> np.ndarray:
         """Features (M, D) of displacements (M, 2 N), rest spacings, and levels (M, N)."""
         moved, light = moved * np.repeat(self.seen, 2), light * self.seen
-        relative = (self.relative_of(moved) - self.relative_mean) @ self.relative
+        relative = (moved / (np.linalg.norm(moved, axis=1, keepdims=True) + self.small) - self.relative_mean) @ self.relative
         return np.concatenate([(moved - self.moved_mean) @ self.moved, relative, (light - self.light_mean) @ self.light], axis=1)
-
-    def relative_of(self, moved: np.ndarray) -> np.ndarray:
-        """Displacements (M, 2 N) divided by their norm plus ``small``."""
-        return moved / (np.linalg.norm(moved, axis=1, keepdims=True) + self.small)
 
     @classmethod
     def learn_bases(cls, moved: np.ndarray, light: np.ndarray, lost: np.ndarray, *, modes: int, light_modes: int) -> "Bases":
@@ -179,13 +175,11 @@ class TouchModel(PinModel):
 
     def prepare_pins(self, pins: PinTable, train: np.ndarray) -> Prepared:
         """See ``Model``. Learns from the training rows the modes, and how a contact changes the similarity to the layout at rest."""
-        nodes_px, lost = pins.nodes_px, pins.lost
+        nodes_px = pins.nodes_px
         for _ in range(ROUNDS):
             registration, _ = fit_registration(nodes_px[train], pins.reference.pins_px)
             lost = _find_untrusted(registration, pins, pins.reference)
-            nodes_px = np.stack(
-                [registration.fill(each, gone) if gone.any() else each for each, gone in zip(pins.nodes_px, lost, strict=True)]
-            )
+            nodes_px = registration.fill(pins.nodes_px, lost)
         moved = _remove_camera_motion(registration, pins, pins.reference, lost, together=False)
         bases = Bases.learn_bases(moved[train], pins.light[train], lost[train], modes=SIZES["modes"], light_modes=SIZES["light_modes"])
         learnt = {"registration": vars(registration), "bases": vars(bases)}
@@ -219,9 +213,7 @@ def _remove_camera_motion(
     registration: Registration, pins: PinTable, reference: Reference, lost: np.ndarray, *, together: bool
 ) -> np.ndarray:
     """Displacements (M, 2 N) in rest spacings, with lost pins filled in, without the displacement of a moved camera."""
-    nodes_px = pins.nodes_px.copy()
-    for k in np.flatnonzero(lost.any(axis=1)):
-        nodes_px[k] = registration.fill(nodes_px[k], lost[k])
+    nodes_px = registration.fill(pins.nodes_px, lost)
     if not pins.measured:
         nodes_px = registration(nodes_px, pins.area_px2, together=together)[0]
     return ((nodes_px - reference.pins_px) / reference.spacing_px.mean()).reshape(len(nodes_px), -1)

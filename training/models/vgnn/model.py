@@ -26,9 +26,8 @@ from training.data.pins import PinTable
 from training.errors import TrainingError
 from training.models.part import Inputs, Learnt, Modes, PinModel, Prepared, Recipe, Variant, Weights, refuse_sizes
 from training.models.vgnn.registration import Registration, count_modes, fit_registration
-from twin.pins import make_graph
+from twin.pins import Reference, make_graph
 from twin.pins.flips import directed_edges
-from twin.pins.labelling.reference import Reference
 from twin.pins.voronoi import triangulate
 
 # Features of a node: dx, dy and the logarithm of the area ratio.
@@ -68,21 +67,12 @@ def pin_features(nodes_px: np.ndarray, area_px2: np.ndarray, reference: Referenc
     return np.concatenate([moved, np.log(area_px2 / reference.area_px2)[..., None]], axis=-1)
 
 
-def fill_lost(
-    registration: Registration, nodes_px: np.ndarray, area_px2: np.ndarray, lost: np.ndarray, reference: Reference
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pins (M, N, 2) and areas (M, N). A lost pin (M, N) is placed by the modes of the other pins' displacements."""
-    nodes_px, area_px2 = nodes_px.copy(), area_px2.copy()
-    for k in np.flatnonzero(lost.any(axis=1)):
-        nodes_px[k] = registration.fill(nodes_px[k], lost[k])
+def fill_lost(registration: Registration, pins: PinTable, reference: Reference) -> tuple[np.ndarray, np.ndarray]:
+    """Pins (M, N, 2) and areas (M, N). A lost pin is placed by the modes of the other pins' displacements."""
+    nodes_px, area_px2 = registration.fill(pins.nodes_px, pins.lost), pins.area_px2.copy()
+    for k in np.flatnonzero(pins.lost.any(axis=1)):
         area_px2[k] = make_graph("voronoi", nodes_px[k], outmost=reference.outmost, net=reference.net).area_px2
     return nodes_px, area_px2
-
-
-def seat_inputs(registration: Registration, filled: tuple, lost: np.ndarray, reference: Reference, *, together: bool = False) -> PinInputs:
-    """Inputs of frames, ``filled`` as by ``fill_lost``, without the camera's displacement; ``together`` as in ``Registration``."""
-    nodes, area, _, share = registration(*filled, together=together)
-    return PinInputs(pin_features(nodes, area, reference), lost, share)
 
 
 @dataclass(frozen=True)
@@ -172,9 +162,7 @@ class Vgnn(nn.Module):
             ``mean`` (B, K) and ``log_scale`` (B, K), standardised; ``executed`` (B,) logit; ``embedding`` (B, width).
         """
         x = self.fill_lost_features(x, lost)
-        parts = []
-        if self.size.modes or self.size.area_modes:
-            parts.append(self.amplitudes(x))
+        parts = [self.amplitudes(x)]
         if self.size.layers:
             states = self.graph(x / self.scale)
             pooled = (self.waves.T @ states.flatten(1)).view(-1, *states.shape[1:])  # (frequencies, B, C)
@@ -300,23 +288,23 @@ class VgnnModel(PinModel):
         In view 1 the whole difference of each frame from the expected camera is removed, as for a camera at another place.
         """
         registration, left = fit_registration(pins.nodes_px[train], pins.reference.pins_px)
-        nodes_px, area_px2 = filled = fill_lost(registration, pins.nodes_px, pins.area_px2, pins.lost, pins.reference)
-        seated = seat_inputs(registration, filled, pins.lost, pins.reference)
-        taken = registration.difference(nodes_px)
+        filled = fill_lost(registration, pins, pins.reference)
+        taken = registration.difference(filled[0])
         taken[train] = left
-        displaced = pin_features(*registration.take_out(nodes_px, area_px2, taken), pins.reference)
-        both = np.concatenate([seated.x.numpy(), displaced])
-        inputs = PinInputs(both, np.concatenate([pins.lost, pins.lost]), np.repeat([0.0, 1.0], len(pins)))
+        views = registration(*filled)[:2], registration.take_out(*filled, taken)
+        features = np.concatenate([pin_features(nodes_px, area_px2, pins.reference) for nodes_px, area_px2 in views])
+        inputs = PinInputs(features, np.concatenate([pins.lost, pins.lost]), np.repeat([0.0, 1.0], len(pins)))
         return Prepared(inputs, {"registration": vars(registration)}, views=2)
 
     def inputs(self, pins: PinTable, learnt: Learnt, reference: Reference, *, together: bool) -> PinInputs:
         """See ``PinModel``. If a frame without contact shows the camera's place, no displacement of the camera is estimated."""
         registration = Registration(**learnt["registration"])
         pins = pins.relative_to(reference) if pins.measured else pins
-        filled = fill_lost(registration, pins.nodes_px, pins.area_px2, pins.lost, reference)
-        if pins.measured:
-            return PinInputs(pin_features(*filled, reference), pins.lost)
-        return seat_inputs(registration, filled, pins.lost, reference, together=together)
+        nodes_px, area_px2 = fill_lost(registration, pins, reference)
+        share = None
+        if not pins.measured:
+            nodes_px, area_px2, _, share = registration(nodes_px, area_px2, together=together)
+        return PinInputs(pin_features(nodes_px, area_px2, reference), pins.lost, share)
 
     def initialise(self, network: nn.Module, inputs: Inputs, rows: torch.Tensor, numbers: torch.Tensor, code: LabelCode) -> None:
         """See ``Model``. Sets the scales of the features and the pin modes."""

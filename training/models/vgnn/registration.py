@@ -94,27 +94,24 @@ class Registration:
         return np.stack([z.real, z.imag], axis=-1) + middle, area_px2 * np.exp(-2 * taken[:, :1])
 
     def fill(self, nodes_px: np.ndarray, lost: np.ndarray) -> np.ndarray:
-        """One frame's pins (N, 2), in which each lost pin (N,) is placed by the modes of the other pins' displacements."""
+        """Frames (M, N, 2), in which each lost pin (M, N) is placed by the modes of the other pins' displacements."""
         directions = self.components / np.maximum(np.linalg.norm(self.components, axis=0), 1e-12)
-        known = np.repeat(~lost, 2)
-        normal = directions[known].T @ directions[known] + FILL_RIDGE * np.eye(directions.shape[1])
-        middle = self.rest_px.mean(axis=0)
-        for _ in range(FILL_ROUNDS):  # the similarity depends on the pins that the round before filled in
-            aligned, similarity = align(nodes_px[None], self.rest_px)
-            away = aligned.ravel() - self.mean
-            found = self.mean + directions @ np.linalg.solve(normal, directions[known].T @ away[known])
-            z = (self.rest_px - middle + found.reshape(-1, 2)) @ [1, 1j] * np.exp(similarity[0, 0] + 1j * similarity[0, 1])
-            filled = np.stack([z.real, z.imag], axis=-1) + middle + similarity[0, 2:]
-            nodes_px = np.where(lost[:, None], filled, nodes_px)
-        return nodes_px
+        filled, middle = nodes_px.copy(), self.rest_px.mean(axis=0)
+        for k in np.flatnonzero(lost.any(axis=1)):
+            known = np.repeat(~lost[k], 2)
+            normal = directions[known].T @ directions[known] + FILL_RIDGE * np.eye(directions.shape[1])
+            for _ in range(FILL_ROUNDS):  # the similarity depends on the pins that the round before filled in
+                aligned, similarity = align(filled[k, None], self.rest_px)
+                away = aligned.ravel() - self.mean
+                found = self.mean + directions @ np.linalg.solve(normal, directions[known].T @ away[known])
+                z = (self.rest_px - middle + found.reshape(-1, 2)) @ [1, 1j] * np.exp(similarity[0, 0] + 1j * similarity[0, 1])
+                filled[k, lost[k]] = (np.stack([z.real, z.imag], axis=-1) + middle + similarity[0, 2:])[lost[k]]
+        return filled
 
     def difference(self, nodes_px: np.ndarray) -> np.ndarray:
         """Differences (M, 4) between the frames' similarities and those expected from their contacts."""
         aligned, observed = align(nodes_px, self.rest_px)
-        return observed - _terms(self._modes(aligned)) @ self.weight
-
-    def _modes(self, aligned: np.ndarray) -> np.ndarray:
-        return (aligned.reshape(len(aligned), -1) - self.mean) @ self.components
+        return observed - _terms((aligned.reshape(len(aligned), -1) - self.mean) @ self.components) @ self.weight
 
 
 def fit_registration(nodes_px: np.ndarray, rest_px: np.ndarray) -> tuple[Registration, np.ndarray]:

@@ -30,9 +30,10 @@ from scenes import ExperimentSpec, ObjectSpec
 from training.data.dataset import Dataset
 from training.data.label_code import wrapped_deg
 from training.data.targets import unit_of
+from training.estimate.contact_estimator import DisplacementModes
 from training.runs.gaussian_process import Kernel, Points, Posterior, Term, fit_processes
 from training.studies.sim_to_real.field import MOST_FRAMES, MOVES_FROM, Left, Missed, TwinField, parts
-from training.studies.sim_to_real.steps import MODES, arm_labels, label_errors, stands_and_moves, states_touching, states_within
+from training.studies.sim_to_real.steps import MODES, arm_labels, error_row, stands_and_moves, states_touching, states_within
 from twin.frames import spread_indices
 from twin.rig.labels import ArmLabel
 
@@ -225,7 +226,7 @@ class _Reader:
         several = frames.rows(frame)
         tried = [starts[frame, which], best[frame]]
         tried[1][:, turn] = tried[0][:, turn]
-        first, second = (self._objective(several, each) for each in tried)
+        first, second = (self._objective(each, self._residual(several, each)) for each in tried)
         labels, objective, _ = self._improve_labels(several, np.where((first < second)[:, None], *tried), self._unknown, 1)
         lowest = np.full(len(best), np.inf)
         np.minimum.at(lowest, frame, objective)
@@ -252,16 +253,14 @@ class _Reader:
         near = far.argmin(axis=1)
         return states[near], far[np.arange(len(near)), near]
 
-    def _improve_labels(
-        self, frames: _Frames, labels: np.ndarray, columns: list[int], steps: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _improve_labels(self, frames: _Frames, labels: np.ndarray, columns: list[int], steps: int) -> tuple[np.ndarray, ...]:
         """Labels (B, 12) after damped Gauss-Newton steps in some columns, J (B,) there, and the logarithm (B,) of the determinant of the
         normal matrix."""
         labels, field = labels.copy(), self._field
         half, prior = self._scales(columns)
         damping = np.full(len(labels), DAMPING)
         residual = self._residual(frames, labels)
-        objective = self._objective(frames, labels, residual)
+        objective = self._objective(labels, residual)
         normal = np.zeros((len(labels), len(columns), len(columns)))
         for _ in range(steps if columns else 0):
             slope = self._slopes(frames, labels, columns, half)
@@ -274,7 +273,7 @@ class _Reader:
             middle, reach = field.middle[self._unknown], BEYOND * field.half[self._unknown]
             moved[:, self._unknown] = np.clip(moved[:, self._unknown], middle - reach, middle + reach)
             there = self._residual(frames, moved)
-            lower = self._objective(frames, moved, there)
+            lower = self._objective(moved, there)
             better = lower < objective
             labels[better], residual[better], objective[better] = moved[better], there[better], lower[better]
             damping *= np.where(better, DAMPING_LESS, DAMPING_MORE)
@@ -286,9 +285,8 @@ class _Reader:
         half = np.array([DIRECTION_DEG if k == field.direction else field.half[k] for k in columns])
         return half, np.array([0.0 if k == field.direction else WIDTH**-2 for k in columns])
 
-    def _objective(self, frames: _Frames, labels: np.ndarray, residual: np.ndarray | None = None) -> np.ndarray:
-        """(B,) J at labels (B, 12)."""
-        left = self._residual(frames, labels) if residual is None else residual
+    def _objective(self, labels: np.ndarray, left: np.ndarray) -> np.ndarray:
+        """(B,) J at labels (B, 12) with the residual ``left`` (B, 2C)."""
         half, prior = self._scales(self._unknown)
         away = (labels[:, self._unknown] - self._field.middle[self._unknown]) / half
         return np.asarray((left**2).sum(axis=1) + (prior * away**2).sum(axis=1))
@@ -338,27 +336,19 @@ class TwinForwards:
         rng = np.random.default_rng(seed)
         rows = np.sort(rng.permutation(len(known_labels))[:MOST_STATES])
         noisy_px = moved_px[rows] + rng.normal(0, NOISE_PX, moved_px[rows].shape)
-        flat, known_labels = noisy_px.reshape(len(rows), -1), known_labels[rows]
-        self._rest = flat.mean(axis=0)
-        _, sizes, directions = np.linalg.svd(flat - self._rest, full_matrices=False)
-        keep = min(MODES, len(rows) - 1)
-        self._modes = directions[:keep].T * np.sqrt(len(rows)) / sizes[0]
+        known_labels, self._modes = known_labels[rows], DisplacementModes.of(noisy_px, MODES)
         self._middle, self._scale = known_labels.mean(axis=0), known_labels.std(axis=0)
-        self._twin, _ = fit_processes(self._inputs(noisy_px), (known_labels - self._middle) / self._scale, seed=seed)
+        self._twin, _ = fit_processes(self._modes(noisy_px), (known_labels - self._middle) / self._scale, seed=seed)
 
     def estimate(self, real_px: np.ndarray, known_labels: np.ndarray, wanted_px: np.ndarray) -> np.ndarray:
         """Labels (B, K) of frames with displacements (B, N, 2), after n labelled ones (n, N, 2) with labels (n, K)."""
-        asked = Points.of(self._inputs(wanted_px))
+        asked = Points.of(self._modes(wanted_px))
         found = self._twin(asked)
         if len(known_labels):
-            known = Points.of(self._inputs(real_px))
+            known = Points.of(self._modes(real_px))
             missed = (known_labels - self._middle) / self._scale - self._twin(known)
             found = found + np.column_stack([_difference(known, label).mean(asked) for label in missed.T])
         return np.asarray(found * self._scale + self._middle)
-
-    def _inputs(self, moved_px: np.ndarray) -> np.ndarray:
-        """Amplitudes (B, D) of the leading modes."""
-        return np.asarray((moved_px.reshape(len(moved_px), self._rest.size) - self._rest) @ self._modes)
 
 
 def _difference(known: Points, missed: np.ndarray) -> Posterior:
@@ -467,24 +457,15 @@ def read_twin(sets: list[Dataset], obj: ObjectSpec, experiment: ExperimentSpec, 
 
 
 def read_row(
-    name: str,
-    twin: TwinRead,
-    real: Dataset,
-    labels: Sequence[ArmLabel],
-    rows: np.ndarray,
-    test: np.ndarray,
-    *,
-    unlabelled: np.ndarray | None = None,
+    name: str, twin: TwinRead, real: Dataset, rows: np.ndarray, test: np.ndarray, *, unlabelled: np.ndarray | None = None
 ) -> dict[str, Any]:
     """A row of the study's table: the twin read after labelled frames ``rows`` (n,), evaluated on ``test`` (t,).
 
-    ``labels`` are those of all frames; those of the frames ``unlabelled`` (u,) are not used.
+    The labels of the frames ``unlabelled`` (u,) are not used.
     """
-    moved = real.pins.nodes_px - real.pins.reference.pins_px
+    labels, moved, targets = arm_labels(real), real.pins.nodes_px - real.pins.reference.pins_px, real.targets.rows(test)
     found = twin.estimate(moved[rows], [labels[row] for row in rows], moved[test], None if unlabelled is None else moved[unlabelled])
-    targets = real.targets.rows(test)
-    row = {"trained_on": name, "labelled_frames": len(rows), "model": READ}
-    return row | label_errors(named_labels(found, targets.names), targets)
+    return error_row(name, len(rows), READ, named_labels(found, targets.names), targets)
 
 
 def named_labels(found: np.ndarray, names: Sequence[str]) -> np.ndarray:

@@ -14,6 +14,7 @@ import numpy as np
 from scenes import ExperimentSpec, ObjectSpec, RandomisationSpec, RigSpec, SensorSpec, load_experiment, load_object, load_randomisation
 from scenes.experiment import MoveRanges
 from scenes.randomisation import FrictionSpread
+from training.data.audit import polynomials
 from training.data.dataset import Dataset, join_datasets, load_dataset, split_rows
 from training.data.design import nearest_to_even
 from training.data.label_code import LabelCode, goes_round, label_error
@@ -21,17 +22,16 @@ from training.data.pins import voronoi_areas
 from training.data.simulated import config_of, is_pins_only, is_simulated, open_simulated
 from training.data.targets import Targets
 from training.errors import TrainingError
+from training.estimate.contact_estimator import DisplacementModes
 from training.estimate.estimator import PoseEstimator
 from training.generation import GenerationConfig, generate, require_count
-from training.models import model_named, recipe_of
-from training.models.steered.model import STEERED
-from training.models.vgnn.model import VGNN
+from training.models import STEERED, VGNN, model_named, recipe_of
 from training.runs.assemble import intervals
 from training.runs.config import RunConfig, frame_marks, identity_of
 from training.runs.gaussian_process import fit_two_fidelities
 from training.runs.run import is_finished, train_run
 from training.runs.run_files import CONFIG, TENSORS, read_tensors, write_tensors
-from training.studies.judging import leak_check, measure_errors
+from training.studies.judging import leak_check
 from training.studies.sim_to_real.discrepancy import FRICTIONS, Discrepancy
 from twin.errors import DatasetError
 from twin.evaluation.labelled.model import MeasuredFrames
@@ -193,24 +193,21 @@ class Twin:
         parts: dict[str, Any] = {"sensor": self.sensor, "object": obj, "experiment": self.experiment, "randomisation": self.randomisation}
         return GenerationConfig(**parts, friction=rig_of(self.sensor).friction, seed=seed, images="none", states="all", across=self.across)
 
-    def simulated_sets(
-        self, plan: SimToRealPlan, out: Path, sensor: SensorSpec, form: Form, given: Sequence[Path], progress: Progress
-    ) -> list[Dataset]:
-        """Contacts as a sensor's data sets: the finished ones ``given``, or one simulated to the folder ``out`` if there are none."""
-        if not given:
-            given = [out / self.contacts]
+    def simulated_sets(self, plan: SimToRealPlan, out: Path, sensor: SensorSpec, form: Form, progress: Progress) -> list[Dataset]:
+        """Contacts as a sensor's data sets: for the full twin the plan's finished ones; if there are none, one simulated to ``out``."""
+        folders = list(plan.simulated) if self.name == FULL else []
+        if not folders:
+            folders = [out / self.contacts]
             with stage(progress, f"{self.name}: {self.experiment.name}") as step:
-                generate(given[0], self.config(plan.target_object, plan.seed), plan.count, workers=plan.workers, progress=step)
+                generate(folders[0], self.config(plan.target_object, plan.seed), plan.count, workers=plan.workers, progress=step)
         found = []
-        for folder in given:
+        for folder in folders:
             with stage(progress, f"states of {folder.name}") as step:
                 found.append(load_dataset(folder, sensor, plan.experiment.targets, form=form, progress=step))
         return found
 
     def part(self, contacts: Dataset) -> Dataset:
         """The states of the contacts that are used for training."""
-        if self.share == 1:
-            return contacts
         group = contact_of(contacts)
         numbers = np.unique(group)
         return contacts.rows(np.flatnonzero(np.isin(group, numbers[: int(np.ceil(self.share * len(numbers)))])))
@@ -478,10 +475,8 @@ def combine_co_kriging(run: Path, out: Path, simulated: Dataset, labelled: Datas
     mean, scale, executed = ensemble.outputs(inputs, rows)
     seen = ensemble.modes(inputs, rows).inputs
     known = ensemble.modes(*estimator.inputs_of(simulated.pins, together=not simulated.pins.measured)).inputs
-    truth = getattr(labelled.targets, labels)
-    process, alone = fit_two_fidelities(
-        known, ensemble.standardise(getattr(simulated.targets, labels)), seen, ensemble.standardise(truth), seed=seed
-    )
+    truth, told = (getattr(part.targets, labels) for part in (labelled, simulated))
+    process, alone = fit_two_fidelities(known, ensemble.standardise(told), seen, ensemble.standardise(truth), seed=seed)
     content = read_tensors(run / TENSORS)
 
     def widths(made: np.ndarray) -> dict[str, np.ndarray]:
@@ -510,47 +505,35 @@ def widen_intervals(run: Path, wider: dict[str, np.ndarray]) -> None:
 
 
 def evaluate_run_row(name: str, labelled: int, run: Path, real: Dataset, test: np.ndarray) -> dict[str, Any]:
-    """A row of the study's table: mean errors of a run on the evaluated frames."""
-    estimator = PoseEstimator.load(run)
-    found = measure_errors(estimator.predict_rows(real, test), real, test)
-    row = {"trained_on": name, "labelled_frames": labelled, "model": estimator.model}
-    for kind in ("corrected", "raw"):
-        row |= {f"{label}_{kind}": found[kind][label]["mae"] for label in real.targets.names}
-    inside = {f"{label}_inside_90": found["corrected"][label]["coverage_90"] for label in real.targets.names}
-    return row | inside | {"leak_slope": found["leak_slope"]}
+    """A row of the study's table: mean errors of a run on the evaluated frames, and how often its intervals contain the label."""
+    estimator, targets = PoseEstimator.load(run), real.targets.rows(test)
+    made = estimator.predict_rows(real, test)
+    inside = (np.abs(label_error(made.mean, targets.corrected, targets.units)) <= made.half_width).mean(axis=0)
+    row = error_row(name, labelled, estimator.model, made.mean, targets)
+    row |= {f"{label}_inside_90": float(share) for label, share in zip(targets.names, inside, strict=True)}
+    return row | {"leak_slope": leak_check(made.mean, targets).slope}
 
 
 def quadratic_row(name: str, real: Dataset, rows: np.ndarray, test: np.ndarray) -> dict[str, Any]:
     """A row of the study's table for the simplest model: ridge regression on the displacements' first modes and their products."""
-    moved = (real.pins.nodes_px - real.pins.reference.pins_px).reshape(len(real), -1)
-    middle = moved[rows].mean(axis=0)
-    _, sizes, directions = np.linalg.svd(moved[rows] - middle, full_matrices=False)
-    keep = min(MODES, len(rows) - 1)
-    modes = (moved - middle) @ directions[:keep].T * np.sqrt(len(rows)) / sizes[0]
-    i, j = np.triu_indices(keep)
-    x = np.concatenate([np.ones((len(real), 1)), modes, modes[:, i] * modes[:, j]], axis=1)
-    code = LabelCode(goes_round(real.targets.units, real.targets.corrected[rows]))
+    moved = real.pins.nodes_px - real.pins.reference.pins_px
+    x = polynomials(DisplacementModes.of(moved[rows], MODES)(moved), 2)
+    targets = real.targets.rows(test)
+    code = LabelCode(goes_round(targets.units, real.targets.corrected[rows]))
     known = code.encode(real.targets.corrected[rows])
     shift = known.mean(axis=0)
-    made = np.empty((len(test), known.shape[1]))
     left, sizes, right = np.linalg.svd(x[rows], full_matrices=False)
-    for k in range(known.shape[1]):
-        y, best = known[:, k] - shift[k], np.inf
-        for ridge in RIDGES:
-            shrunk = sizes**2 / (sizes**2 + ridge)
-            fitted = left @ (shrunk * (left.T @ y))
-            error = np.abs((y - fitted) / (1 - (left**2) @ shrunk)).mean()  # leave-one-out error
-            if error < best:
-                best = error
-                made[:, k] = x[test] @ (right.T @ (shrunk / sizes * (left.T @ y))) + shift[k]
-    row = {"trained_on": name, "labelled_frames": len(rows), "model": "quadratic regression"}
-    told, targets = code.decode(made, np.zeros_like(made))[0], real.targets.rows(test)
-    return row | label_errors(told, targets) | {"leak_slope": leak_check(told, targets).slope}
+    shrunk, along = sizes**2 / (sizes**2 + RIDGES[:, None]), left.T @ (known - shift)
+    fitted, leverage = left @ (shrunk[..., None] * along), shrunk @ (left**2).T
+    errors = np.abs((known - shift - fitted) / (1 - leverage)[..., None]).mean(axis=1)  # leave-one-out errors of each ridge and number
+    made = x[test] @ right.T @ (shrunk[errors.argmin(axis=0)].T / sizes[:, None] * along) + shift
+    told = code.decode(made, np.zeros_like(made))[0]
+    return error_row(name, len(rows), "quadratic regression", told, targets) | {"leak_slope": leak_check(told, targets).slope}
 
 
-def label_errors(made: np.ndarray, targets: Targets) -> dict[str, Any]:
-    """The entries of the study's table for estimated labels (M, K): mean absolute errors."""
-    row: dict[str, Any] = {}
+def error_row(name: str, labelled: int, model: str, made: np.ndarray, targets: Targets) -> dict[str, Any]:
+    """A row of the study's table for estimated labels (M, K): mean absolute errors."""
+    row: dict[str, Any] = {"trained_on": name, "labelled_frames": labelled, "model": model}
     for kind in ("corrected", "raw"):
         errors = np.abs(label_error(made, getattr(targets, kind), targets.units)).mean(axis=0)
         row |= {f"{label}_{kind}": float(error) for label, error in zip(targets.names, errors, strict=True)}

@@ -3,6 +3,11 @@
 One of its networks is trained on real frames without labels: model inversion estimates their labels (pseudo-labels). The twin is read in
 seconds for hundreds of frames, but not by a live loop. The network has nearly its errors, and is a run as any other. It needs no label of
 these frames, only more of them.
+
+``label_efficiency`` is the value of the twin for models that need no training: errors by the number of labelled frames, with and without
+the twin. With the twin: it is read (``read_twin``). Without: quadratic regression. Both with frames sampled at random and with frames
+nearest to an even sequence. With the twin also: frames without labels beside labelled ones. All models together take minutes for a plate,
+and half an hour for an edge with five thousand frames.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +22,8 @@ from matplotlib.ticker import NullLocator
 
 from scenes import load_randomisation
 from training.data.dataset import Dataset, join_datasets, load_dataset
-from training.data.targets import Targets, unit_of
+from training.data.label_code import goes_round
+from training.data.targets import unit_of
 from training.estimate.estimator import PoseEstimator
 from training.runs.assemble import intervals
 from training.studies.sim_to_real import steps
@@ -27,11 +33,9 @@ from training.studies.sim_to_real.steps import BOTH, EVENLY, REAL, WITHOUT, SimT
 from twin.calibration.contact import fit_contact
 from twin.calibration.contact.fit import CalibrationSetup
 from twin.estimate import readable_labels
-from twin.evaluation.labelled.model import MeasuredFrames
 from twin.progress import Progress, Step, silent, stage, unheard
 from twin.report.charts import muted_colour, plain_log, sized_figure, write_chart
 from twin.report.page import BLUE, OLIVE, PURPLE, RED, Column, Page, PagePicture, number, write_table
-from twin.rig.labels import ArmLabel
 from twin.store import writes
 from twin.types import ReadableResult
 
@@ -44,19 +48,12 @@ SIMULATED = "simulated"
 BARE = "simulated, bare"
 # Colours and lines of the models trained on real frames, in the order of the rows.
 STYLES = ((RED, "o-"), (OLIVE, "s--"))
+UNLABELLED = (300, 3000)
+"""Numbers of frames without labels that the twin is given beside the labelled ones, where a label is a direction."""
 
 
 def teach(
-    twin: TwinRead,
-    real: Dataset,
-    labels: Sequence[ArmLabel],
-    few: np.ndarray,
-    unlabelled: np.ndarray,
-    out: Path,
-    *,
-    seed: int,
-    epochs: int | None,
-    progress: Step = unheard,
+    twin: TwinRead, real: Dataset, few: np.ndarray, rows: np.ndarray, out: Path, *, seed: int, epochs: int | None, progress: Step = unheard
 ) -> None:
     """Train a run on labelled frames and on frames whose labels that model inversion estimates, or continue it.
 
@@ -66,20 +63,21 @@ def teach(
     ----------
     real : Dataset
         A recording.
-    labels : sequence of ArmLabel
-        Of all its frames. Those of the frames ``unlabelled`` are not used.
-    few, unlabelled : (n,) and (u,) int
-        Rows of the labelled frames, and of the others to learn from.
+    few, rows : (n,) and (n + u,) int
+        Rows of the labelled frames, and all rows to learn from. The labels of those that are not among ``few`` are not used.
     out : Path
         Folder of the run.
     epochs : int or None
         None: the recipe's own.
     """
-    moved, known = real.pins.nodes_px - real.pins.reference.pins_px, [labels[row] for row in few]
-    told = named_labels(twin.estimate(moved[few], known, moved[unlabelled], moved[unlabelled]), real.targets.names)
-    rows = np.sort(np.concatenate([few, unlabelled]))
-    taught = replace(real, targets=_with_estimated(real.targets, few, unlabelled, told)).rows(rows)
-    steps.train_on_real(taught, out, seed=seed, epochs=epochs, progress=progress)
+    labels, moved, targets = steps.arm_labels(real), real.pins.nodes_px - real.pins.reference.pins_px, real.targets
+    known, unlabelled = [labels[row] for row in few], np.setdiff1d(rows, few)
+    corrected, unknown = targets.corrected.copy(), np.full(len(real), np.nan)
+    corrected[unlabelled] = named_labels(twin.estimate(moved[few], known, moved[unlabelled], moved[unlabelled]), targets.names)
+    raw = corrected.copy()
+    raw[few] = targets.raw[few]
+    estimated = replace(targets, raw=raw, corrected=corrected, executed=unknown, move=np.full_like(targets.move, np.nan))
+    steps.train_on_real(replace(real, targets=estimated).rows(rows), out, seed=seed, epochs=epochs, progress=progress)
     judged, found = twin.left_out(moved[few], known)
     part = real.rows(few[judged])
     if not len(part):
@@ -91,15 +89,6 @@ def teach(
     made = named_labels(found, part.targets.names)
     said = intervals(made, scale, part.targets.corrected, part.targets.raw, executed, part.targets.units)
     steps.widen_intervals(out, {key: np.maximum(getattr(estimator.ensemble, key), width) for key, width in said.items()})
-
-
-def _with_estimated(targets: Targets, few: np.ndarray, unlabelled: np.ndarray, told: np.ndarray) -> Targets:
-    """Targets with the labels (u, K) that are estimated for frames without; nothing is known of their moves."""
-    corrected, nothing = targets.corrected.copy(), np.full(len(targets.executed), np.nan)
-    corrected[unlabelled] = told
-    raw = corrected.copy()
-    raw[few] = targets.raw[few]
-    return replace(targets, raw=raw, corrected=corrected, executed=nothing, move=np.full_like(targets.move, np.nan))
 
 
 @dataclass(frozen=True, repr=False)
@@ -143,8 +132,6 @@ class Ground:
     real, few : Dataset
         The recording, and its labelled frames.
     chosen : Frames
-    measured : MeasuredFrames
-        Pins and arm's labels of the labelled frames.
     residuals : Residuals
         Residuals of the twin with all ingredients on the labelled frames.
     full : Twin
@@ -158,7 +145,6 @@ class Ground:
     real: Dataset
     few: Dataset
     chosen: steps.StudyFrames
-    measured: MeasuredFrames
     residuals: Residuals
     full: steps.Twin
     twins: list[steps.Twin]
@@ -180,10 +166,13 @@ def run(plan: SimToRealPlan, out: Path, *, progress: Progress = silent) -> SimTo
     sets: dict[str, list[Dataset]] = {}
     rows: list[dict[str, Any]] = []
     for twin in ground.twins:
-        folder, given = out / twin.name, plan.simulated if twin is ground.full else ()
-        missing = _missing(ground, twin) if twin.learns else None
+        folder, missing = out / twin.name, None
+        if twin.learns:
+            with stage(progress, f"{twin.name}: labelled frames") as step:  # what was simulated for another twin is not simulated again
+                setup = replace(ground.setup, across=twin.across)
+                missing = Discrepancy(measure_residuals(setup, steps.measured_of(few), step, frictions=twin.frictions))
         if twin.contacts not in sets:
-            sets[twin.contacts] = twin.simulated_sets(plan, out, ground.setup.sensor, real.pins.form, given, progress)
+            sets[twin.contacts] = twin.simulated_sets(plan, out, ground.setup.sensor, real.pins.form, progress)
         learnt = _training_sets(ground, twin, sets[twin.contacts], missing)
         every, labelled = learnt[0].with_copies([each.pins for each in learnt[1:]]), few if twin.learns else None
         with stage(progress, twin.name) as step:
@@ -219,14 +208,7 @@ def _prepare(plan: SimToRealPlan, out: Path, progress: Progress) -> Ground:
     sheared = any(label.move.any() for label in measured.labels)
     full = steps.full_twin(plan, setup.sensor, measured.labels, (residuals.friction_spread() or moves.friction) if sheared else None)
     others = steps.without_one_ingredient(full, steps.as_mounted(plan.sensor), moves, load_randomisation("contact")) if plan.ablate else []
-    return Ground(plan, out, progress, setup, real, few, chosen, measured, residuals, full, [full, *others])
-
-
-def _missing(ground: Ground, twin: steps.Twin) -> Discrepancy:
-    """The discrepancy of a twin. Contacts that were simulated for another one are not simulated again."""
-    with stage(ground.progress, f"{twin.name}: labelled frames") as step:
-        setup = replace(ground.setup, across=twin.across)
-        return Discrepancy(measure_residuals(setup, ground.measured, step, frictions=twin.frictions))
+    return Ground(plan, out, progress, setup, real, few, chosen, residuals, full, [full, *others])
 
 
 def _training_sets(ground: Ground, twin: steps.Twin, sets: list[Dataset], missing: Discrepancy | None) -> list[Dataset]:
@@ -249,13 +231,13 @@ def _from_the_read_twin(ground: Ground, sets: list[Dataset]) -> list[dict[str, A
     """
     plan, real, chosen, folder = ground.plan, ground.real, ground.chosen, ground.out / TAUGHT
     twin = read_twin(sets, plan.target_object, plan.experiment, seed=plan.seed)
-    labels, others = steps.arm_labels(real), np.setdiff1d(chosen.trained["all"], chosen.few)
     asked = [(BOTH, rows) for rows in (np.zeros(0, int), *chosen.nested)]
     asked += [(f"{BOTH}{EVENLY}", rows) for rows in steps.designed_frames(real, chosen, plan.seed)]
-    read = [read_row(name, twin, real, labels, rows, chosen.test) for name, rows in asked]
+    read = [read_row(name, twin, real, rows, chosen.test) for name, rows in asked]
     with stage(ground.progress, TAUGHT) as step:
-        teach(twin, real, labels, chosen.few, others, folder, seed=plan.seed, epochs=plan.epochs, progress=step)
-    return [*read, steps.evaluate_run_row(BOTH + WITHOUT.format(count=len(others)), plan.labels, folder, real, chosen.test)]
+        teach(twin, real, chosen.few, chosen.trained["all"], folder, seed=plan.seed, epochs=plan.epochs, progress=step)
+    name = BOTH + WITHOUT.format(count=len(chosen.trained["all"]) - plan.labels)
+    return [*read, steps.evaluate_run_row(name, plan.labels, folder, real, chosen.test)]
 
 
 def _without_the_twin(ground: Ground) -> list[dict[str, Any]]:
@@ -273,9 +255,7 @@ def _without_the_twin(ground: Ground) -> list[dict[str, Any]]:
     return rows + [steps.quadratic_row(name, real, index, chosen.test) for name, index in others]
 
 
-def write_page(
-    ground: Ground, rows: Sequence[Mapping[str, Any]], beside: steps.CoKriging, modes: Sequence[Mapping[str, float]], learnt: Dataset
-) -> Path:
+def write_page(ground: Ground, rows: Sequence[Mapping], beside: steps.CoKriging, modes: Sequence[Mapping], learnt: Dataset) -> Path:
     """Write ``index.html`` and its charts, and return the page's path.
 
     Parameters
@@ -360,8 +340,8 @@ def errors_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
         key = f"{name}_corrected"
         models = dict.fromkeys(row["model"] for row in _of(rows, REAL))
         for model, (color, line) in zip(models, STYLES[-len(models) :], strict=False):
-            _curve(ax, _model(rows, REAL, model), key, line, color, f"real frames, {model}")
-            _curve(ax, _model(rows, f"{REAL}{EVENLY}", model), key, "s:", color, f"evenly chosen frames, {model}")
+            _curve(ax, rows, key, (REAL, model), line, color, f"real frames, {model}")
+            _curve(ax, rows, key, (f"{REAL}{EVENLY}", model), "s:", color, f"evenly chosen frames, {model}")
         for row in _of(rows, SIMULATED):
             ax.axhline(row[key], color=BLUE, ls=(0, (5, 2)), label="twin alone")
         for row in _of(rows, BOTH):
@@ -369,8 +349,8 @@ def errors_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
                 ax.plot(row["labelled_frames"], row[key], "*", color=PURPLE, ms=13, label="twin and labelled frames")
             elif not row["labelled_frames"]:
                 ax.axhline(row[key], color=PURPLE, ls=(0, (1, 2)), label="model inversion, no label")
-        _curve(ax, _model(rows, BOTH, READ), key, "^-", PURPLE, "model inversion")
-        _curve(ax, _model(rows, f"{BOTH}{EVENLY}", READ), key, "^:", PURPLE, "model inversion, evenly chosen frames")
+        _curve(ax, rows, key, (BOTH, READ), "^-", PURPLE, "model inversion")
+        _curve(ax, rows, key, (f"{BOTH}{EVENLY}", READ), "^:", PURPLE, "model inversion, evenly chosen frames")
         ax.set(title=f"{label} error", xlabel="labelled real frames", ylabel=f"mean absolute error, {unit_of(name)}")
         ax.set(xscale="log", yscale="log")
         counts = sorted({row["labelled_frames"] for row in rows if row["labelled_frames"]})
@@ -381,16 +361,11 @@ def errors_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
     return figure
 
 
-def _model(rows: Sequence[Mapping], trained_on: str, model: str) -> list[Mapping]:
-    """Rows of one model with labelled frames, by their number."""
-    mine = [row for row in _of(rows, trained_on) if row["model"] == model and row["labelled_frames"]]
-    return sorted(mine, key=lambda row: row["labelled_frames"])
-
-
-def _curve(ax: Axes, rows: Sequence[Mapping], key: str, line: str, color: str, label: str) -> None:
-    """The errors of some rows by their numbers of labelled frames."""
-    if rows:
-        ax.plot([row["labelled_frames"] for row in rows], [row[key] for row in rows], line, color=color, label=label)
+def _curve(ax: Axes, rows: Sequence[Mapping], key: str, of: tuple[str, str], line: str, color: str, label: str) -> None:
+    """The errors of the rows of what was trained on, and model, by their numbers of labelled frames."""
+    known = sorted((row["labelled_frames"], row[key]) for row in rows if (row["trained_on"], row["model"]) == of and row["labelled_frames"])
+    if known:
+        ax.plot(*zip(*known, strict=True), line, color=color, label=label)
 
 
 def ingredients_figure(rows: Sequence[Mapping], names: Sequence[str]) -> Figure:
@@ -421,3 +396,53 @@ def _column(key: str, names: Sequence[str]) -> Column:
 
 def _percents(modes: Sequence[Mapping[str, float]], key: str) -> str:
     return ", ".join(f"{100 * mode[key]:.0f} %" for mode in modes)
+
+
+def label_efficiency(plan: SimToRealPlan, out: Path, seeds: Sequence[int], *, progress: Progress = silent) -> list[dict[str, Any]]:
+    """Rows as those of the study's table: the mean over the draws of frames by these seeds, and the largest. Contacts have the rig's one
+    friction.
+
+    Parameters
+    ----------
+    plan : SimToRealPlan
+        ``draws``, ``calibrate``, ``ablate`` and ``epochs`` do not matter; ``seed`` is that of the contacts.
+    out : Path
+        Folder of the simulated contacts; those that it holds are used again.
+
+    Raises
+    ------
+    TrainingError
+        There are too few frames, or the labels of the simulated contacts differ from theirs.
+    """
+    with stage(progress, "frames") as step:
+        real = load_dataset(plan.frames, plan.sensor, plan.experiment.targets, progress=step).in_order()
+    full = steps.full_twin(plan, plan.sensor, steps.arm_labels(real), None)
+    sets = full.simulated_sets(plan, out, plan.sensor, real.pins.form, progress)
+    twin = read_twin(sets, plan.target_object, plan.experiment, seed=plan.seed)
+    unlabelled = UNLABELLED if any(goes_round(real.targets.units, real.targets.corrected)) else ()
+    found: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
+    for seed in seeds:
+        chosen = steps.choose_frames(len(real), plan.labels, seed)
+        every = [np.zeros(0, int), *chosen.nested, chosen.trained["all"]]
+        made = []
+        for designed, among in (("", every), (EVENLY, steps.designed_frames(real, chosen, seed))):
+            for rows in among:
+                made.append(read_row(f"{BOTH}{designed}", twin, real, rows, chosen.test))
+                if len(rows):
+                    made.append(steps.quadratic_row(f"{REAL}{designed}", real, rows, chosen.test))
+        pool = np.random.default_rng(seed).permutation(np.setdiff1d(chosen.trained["all"], chosen.few))
+        for count in unlabelled:
+            if count <= len(pool):
+                name, more = BOTH + WITHOUT.format(count=count), np.sort(pool[:count])
+                made.append(read_row(name, twin, real, chosen.few, chosen.test, unlabelled=more))
+        for row in made:
+            found.setdefault((row["trained_on"], row["model"], row["labelled_frames"]), []).append(row)
+    return [_summary(rows) for rows in found.values()]
+
+
+def _summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """One row with the mean of each error, and its largest value as ``KEY_most``."""
+    errors = {key: [row[key] for row in rows] for key in rows[0] if key.endswith(("_corrected", "_raw"))}
+    named = {key: rows[0][key] for key in ("trained_on", "labelled_frames", "model")}
+    most = {f"{key}_most": float(max(each)) for key, each in errors.items()}
+    return named | {key: float(np.mean(each)) for key, each in errors.items()} | most

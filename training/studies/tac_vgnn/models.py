@@ -1,6 +1,5 @@
 """The models of the paper's comparison. All are trained and evaluated on the same rows, and timed at several batch sizes."""
 
-import csv
 import ctypes
 import gc
 from dataclasses import dataclass
@@ -81,12 +80,10 @@ def train_all(
         if is_finished(plan.config, data, folder):
             spent[plan.folder] = 0.0
             continue
-        share = None
-        if max_minutes is not None:
-            share = (max_minutes - (monotonic() - started) / 60) / (len(plans) - k)
-            if share <= 0:
-                continue
         begun = monotonic()
+        share = None if max_minutes is None else (max_minutes - (begun - started) / 60) / (len(plans) - k)
+        if share is not None and share <= 0:
+            continue
         with stage(progress, plan.name) as step:
             train_run(plan.config, data, folder, max_minutes=share, device=device, progress=step)
         spent[plan.folder] = (monotonic() - begun) / 60
@@ -104,10 +101,9 @@ def table_row(plan: PlannedRun, data: Dataset, out: Path, minutes: float | None)
     rows = rows_to_evaluate(estimator, data, "validation")
     metrics = measure_errors(estimator.predict_rows(data, rows), data, rows)
     curves = read_curves(folder)
-    seconds = [point["seconds"] for point in curves]
     row |= {"state": "ended early" if (folder / CHECKPOINT).exists() else "finished", "parameters": read_config(folder)["parameters"]}
     row |= {"epochs": len(curves), "epochs_allowed": plan.config.recipe.epochs * plan.config.recipe.members}
-    row |= {"training_minutes": sum(seconds) / 60, "s_per_epoch": float(np.median(seconds))}
+    row |= {"training_minutes": float(curves["seconds"].sum()) / 60, "s_per_epoch": float(np.median(curves["seconds"]))}
     row |= {key: metrics[key] for key in ("frames", "without_prediction", "leak_slope")}
     for kind in ("raw", "corrected"):
         for name in data.targets.names:
@@ -118,15 +114,9 @@ def table_row(plan: PlannedRun, data: Dataset, out: Path, minutes: float | None)
     return row | {"paper_mm": paper[0], "paper_deg": paper[1]}
 
 
-def error_columns(data: Dataset) -> list[str]:
-    """Columns of a row that hold errors."""
-    return [f"{name}_{kind}" for kind in ("raw", "corrected") for name in data.targets.names]
-
-
-def read_curves(folder: Path) -> list[dict[str, float]]:
-    """The learning curve of a run: a dict of numbers for each epoch, one network after the other."""
-    with (folder / "curves.csv").open(newline="", encoding="utf-8") as file:
-        return [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+def read_curves(folder: Path) -> np.ndarray:
+    """The learning curve of a run: a record of named numbers for each epoch, one network after the other."""
+    return np.atleast_1d(np.genfromtxt(folder / "curves.csv", delimiter=",", names=True))
 
 
 class PeakMemory:

@@ -7,8 +7,9 @@ of the sensor, and a surface that reaches only its top or only its bottom. Recor
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from time import perf_counter
+from timeit import timeit
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from training.data.pins import PinTable
 from training.data.targets import ANGLE, DEPTH, unit_of
 from training.models import model_named
 from training.runs.loop import choose_device
-from training.studies.tac_vgnn.models import PlannedRun, error_columns, measure_training, plan_run, read_curves, table_row, train_all
+from training.studies.tac_vgnn.models import PlannedRun, measure_training, plan_run, read_curves, table_row, train_all
 from training.surrogate.symmetry import about_z
 from twin.errors import OptionError, TwinError
 from twin.estimate import readable_labels
@@ -66,13 +67,8 @@ USUAL = {"depth_mm": 0.25, "angle_deg": 1.5, "shear_mm": 0.5, "shear_deg": 0.7}
 MODELS = ("gnn", "tac-vgnn", "vgnn", "cnn-v2", "cnn-v1")
 # Batch sizes of the efficiency figure.
 BATCHES = (64, 256, 512)
-# Columns of the page's table of models that hold no errors, in the order of the table.
-SHOWN = (
-    *("model", "seed", "state", "epochs", "epochs_allowed", "training_minutes", "s_per_epoch", "parameters"),
-    *("frames", "without_prediction", "leak_slope", "paper_mm", "paper_deg"),
-)
-# Columns of the table of models that name a run.
-RUN = ("model", "seed", "state")
+# Columns of the page's table of models that name a run, and those after its errors.
+RUN, FURTHER = ("model", "seed", "state"), ("frames", "without_prediction", "leak_slope", "paper_mm", "paper_deg")
 # Columns about training, which are shown in a separate table.
 TRAINING = ("epochs", "epochs_allowed", "training_minutes", "s_per_epoch", "parameters")
 # Number of points up to which the points of a curve are marked, because a line of one or two points can't be seen.
@@ -88,11 +84,6 @@ HEADINGS = {  # titles and units of columns of the tables that their keys do not
     "paper_mm": ("paper, depth", "mm"),
     "paper_deg": ("paper, angle", "deg"),
     "paper_ms": ("paper, time", "ms"),
-    "edges_no_contact": ("edges, no contact", ""),
-    "edges_least": ("edges, least", ""),
-    "edges_most": ("edges, most", ""),
-    "growth_x_px": ("growth at x", "px"),
-    "growth_y_px": ("growth at y", "px"),
 }
 
 FILES = (
@@ -104,19 +95,15 @@ FILES = (
 def compare_graphs(pins: PinTable) -> list[dict[str, Any]]:
     """One row for each kind of graph: nodes, features, directed edges without contact and in the frames, and the median time, ms."""
     outmost, rest = pins.reference.outmost, pins.reference.pins_px
-    chosen = np.linspace(0, len(pins) - 1, min(TIMED, len(pins))).astype(int)
+    frames = pins.nodes_px[np.linspace(0, len(pins) - 1, min(TIMED, len(pins))).astype(int)]
     rows = []
     for kind in KINDS:
-        still = make_graph(kind, rest, outmost=outmost)  # not timed: the first call loads the compiled code
-        taken, edges = [], []
-        for k in chosen:
-            started = perf_counter()
-            graph = make_graph(kind, pins.nodes_px[k], outmost=outmost)
-            taken.append(1e3 * (perf_counter() - started))
-            edges.append(len(graph.edges))
+        make = partial(make_graph, kind, outmost=outmost)
+        still, edges = make(rest), [len(make(nodes_px).edges) for nodes_px in frames]
+        ms = 1e3 * float(np.median([timeit(partial(make, nodes_px), number=1) for nodes_px in frames]))
         paper_edges, paper_s = PAPER.get((len(rest), kind), (None, None))
         row: dict[str, Any] = {"graph": kind, "nodes": len(rest), "features": 3 if kind == "voronoi" else 2}
-        row |= {"edges_no_contact": len(still.edges), "edges_least": min(edges), "edges_most": max(edges), "ms": float(np.median(taken))}
+        row |= {"edges_no_contact": len(still.edges), "edges_least": min(edges), "edges_most": max(edges), "ms": ms}
         rows.append(row | {"paper_edges": paper_edges, "paper_ms": None if paper_s is None else 1e3 * paper_s})
     return rows
 
@@ -307,14 +294,12 @@ class TacVgnnResult(ReadableResult):
 
     def lines(self) -> list[str]:
         """The result as lines of text: the number of frames, then one for each run."""
-        runs = [f"{row['model']}, seed {row['seed']}: {row['state']}{self._errors(row)}" for row in self.rows]
-        return [f"{self.frames} labelled frames", *runs]
-
-    def _errors(self, row: dict[str, Any]) -> str:
-        if "epochs" not in row:
-            return ""
-        known = zip(self.names, readable_labels(self.names), strict=True)
-        return ", " + "; ".join(f"{label} {row[f'{k}_raw']:.4g} raw, {row[f'{k}_corrected']:.4g} corrected" for k, label in known)
+        lines, labels = [f"{self.frames} labelled frames"], dict(zip(self.names, readable_labels(self.names), strict=True))
+        for row in self.rows:
+            known = labels if "epochs" in row else {}
+            errors = [f"{label} {row[f'{name}_raw']:.4g} raw, {row[f'{name}_corrected']:.4g} corrected" for name, label in known.items()]
+            lines.append(f"{row['model']}, seed {row['seed']}: {row['state']}{', ' if errors else ''}{'; '.join(errors)}")
+        return lines
 
 
 @writes(*FILES)
@@ -358,14 +343,12 @@ def run(plan: TacVgnnPlan, out: Path, *, progress: Progress = silent) -> TacVgnn
     contacts = [change.figures() for change in changes]
     if contacts:
         written += [write_table(out / "contacts.csv", contacts), write_chart(out / "contacts.png", lambda: contacts_figure(changes))]
-    notes = {"device": device, "threads": torch.get_num_threads(), "labels": plan.labels, "max_minutes": plan.max_minutes}
-    notes["columns"] = [*SHOWN, *error_columns(data)]
     tables = {"models": rows, "graphs": graphs, "efficiency": efficiency, "contacts": contacts}
-    written.append(write_page(out, data, tables, notes))
+    written.append(write_page(out, data, tables, plan, f"{device}, {torch.get_num_threads()} threads"))
     return TacVgnnResult(rows, graphs, efficiency, contacts, data.targets.names, len(data), written)
 
 
-def write_page(out: Path, data: Dataset, tables: Mapping[str, list[dict]], notes: dict) -> Path:
+def write_page(out: Path, data: Dataset, tables: Mapping[str, list[dict]], plan: TacVgnnPlan, machine: str) -> Path:
     """Write ``index.html``, which shows all tables and charts in the same folder.
 
     Parameters
@@ -374,36 +357,34 @@ def write_page(out: Path, data: Dataset, tables: Mapping[str, list[dict]], notes
     data : Dataset
     tables : mapping of str to list of dict
         Rows of the tables ``models``, ``graphs``, ``efficiency`` and ``contacts``; the last two may be empty.
-    notes : dict
-        ``columns`` of the table of models, kind of ``labels`` that were used, ``max_minutes``, ``device`` and ``threads``.
+    plan : TacVgnnPlan
+    machine : str
+        Device and number of threads.
     """
-    ranges = ", ".join(
-        f"{name} [{number(float(data.targets.raw[:, k].min()))}, {number(float(data.targets.raw[:, k].max()))}] {unit}"
-        for k, (name, unit) in enumerate(zip(readable_labels(data.targets.names), data.targets.units, strict=True))
-    )
+    ends = data.targets.raw.min(axis=0).tolist(), data.targets.raw.max(axis=0).tolist()
+    known = zip(readable_labels(data.targets.names), data.targets.units, *ends, strict=True)
+    ranges = ", ".join(f"{name} [{number(low)}, {number(high)}] {unit}" for name, unit, low, high in known)
     page = Page(
         f"The Tac-VGNN paper's comparison on {data.pins.sensor.name}",
         "twin study tac-vgnn",
         topic="TacTip twin: study",
         lead=f"{len(data)} labelled frames. The paper used other data: depth [-2, 2] mm and angle [-30, 30] deg; here {ranges}. Its "
         "figures are shown for orientation; equal figures would not mean equal models. Times are of this machine "
-        f"({notes['device']}, {notes['threads']} threads), the paper's of a Titan Xp.",
+        f"({machine}), the paper's of a Titan Xp.",
     )
     page.notice("Notes on the recording", data.problems)
-    minutes = notes["max_minutes"]
+    minutes = plan.max_minutes
     given = "" if minutes is None else f" This time {number(minutes, 4)} minutes were given to all training together."
     page.section(
         "Errors",
         "Mean absolute errors on the random fifth of the frames that are kept out of all training (every frame counts; those without a "
-        f"prediction are listed), of models that were trained on {notes['labels']} labels. Corrected labels have the shear moves that were "
+        f"prediction are listed), of models that were trained on {plan.labels} labels. Corrected labels have the shear moves that were "
         "never executed taken out. The leak slope is that of the angle's error on such moves: a model that reads the contact has 0, one "
         f"that reads the time of the frame has not.{given} The error of a run that ended early is what it reached in its time, not what it "
         "would reach. The least error of each column is marked.",
     )
-    errors = error_columns(data)
-    shown = [key for key in notes["columns"] if key not in TRAINING]
-    shown.sort(key=lambda key: (key not in RUN, key not in errors))  # the run, its errors, the rest
-    page.table(tables["models"], [_column(key, errors) for key in shown])
+    errors = [f"{name}_{kind}" for kind in ("raw", "corrected") for name in data.targets.names]
+    page.table(tables["models"], [_column(key, errors) for key in (*RUN, *errors, *FURTHER)])
     page.table(tables["models"], [_column(key) for key in (*RUN, *TRAINING)], caption="What training took")
     for key in errors:
         if order := ordering(tables["models"], key):
@@ -483,8 +464,9 @@ def curves_figure(plans: Sequence[PlannedRun], folder: Path) -> Figure:
     first = {plan.name: plan for plan in reversed(plans)}  # of each name, which alone is labelled
     names = list(dict.fromkeys(plan.name for plan in plans))
     for plan in plans:
-        curve = [point for point in read_curves(folder / plan.folder) if point["network"] == 0]
-        error, minutes = [point["held_out_error"] for point in curve], np.cumsum([point["seconds"] / 60 for point in curve])
+        curve = read_curves(folder / plan.folder)
+        curve = curve[curve["network"] == 0]
+        error, minutes = curve["held_out_error"], np.cumsum(curve["seconds"]) / 60
         rank = names.index(plan.name)
         look = {"color": SERIES[rank % len(SERIES)], "linestyle": LINES[rank // len(SERIES) % len(LINES)], "linewidth": 1.2}
         look["marker"] = "." if len(curve) < FEW else None

@@ -380,7 +380,7 @@ class NewestTarget:
         self._target: np.ndarray | None = None
         self._sent: np.ndarray | None = None  # end of the newest piece
         self._due_s = 0.0  # when the arm should reach the end of the newest piece
-        self._error: DeviceError | None = None
+        self._error: Exception | None = None
 
     def start(self) -> None:
         """Start the thread. There is no target yet."""
@@ -428,7 +428,7 @@ class NewestTarget:
             with self._lock:
                 try:
                     self._step()
-                except DeviceError as error:
+                except Exception as error:  # also one of an arm of another package
                     self._error, self._target = error, None
                 if self._target is None and not self._ended.is_set():
                     self._wake.clear()

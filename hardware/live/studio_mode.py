@@ -4,7 +4,6 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -150,10 +149,11 @@ class WatchedArm:
 
     def close(self) -> None:
         """Disarm the arm if it is armed, and close the connection."""
-        if self.armed:
-            with suppress(DeviceError):
+        try:
+            if self.armed:
                 self.disarm()
-        self._arm.disconnect()
+        finally:
+            self._arm.disconnect()
 
 
 def require_feed(camera: str, arm: str, recording: str, sensor: SensorSpec) -> None:

@@ -208,7 +208,7 @@ def run_gripper(
     DeviceError
         The arm fails or refuses a move, or there are no frames or no valid pins for too long.
     """
-    found: list[GripStep] = []
+    found, failed = list[GripStep](), list[str]()
 
     def blind() -> str:
         return "; ".join(f"{name}: {why}" for name, source in rig.sources.items() if (why := source.blind()))
@@ -226,7 +226,7 @@ def run_gripper(
             of = ros2 and f"{ros2}/{name}"
             stack.enter_context(publishing(of, source, pipelines[name], estimates=False, arm=lambda: watch.newest))
         stack.enter_context(watch.alert())
-        stack.callback(lambda: try_each(stop=rig.arm.stop, disable=rig.arm.disable))
+        stack.callback(lambda: failed.extend(try_each(stop=rig.arm.stop, disable=rig.arm.disable)))
         stack.enter_context(watch.watching())
         stack.enter_context(eyes.watching())
         asked_s = due_s = time.monotonic()
@@ -259,6 +259,8 @@ def run_gripper(
             time.sleep(max(0.0, due_s - time.monotonic()))
             asked_s = valid_s = time.monotonic()
             due_s = max(due_s, asked_s) + period_s
+    if failed:
+        raise DeviceError("; ".join(failed))
     return found
 
 

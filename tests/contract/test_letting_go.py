@@ -249,6 +249,14 @@ def test_an_armed_arm_is_let_go_of_though_the_recording_can_not_be_ended(feed, t
     assert not emulator.arm.enabled and not made.robot.armed
 
 
+def test_an_armed_arm_that_is_lost_as_the_feed_ends_is_told(feed):
+    made, emulator, _ = feed
+    emulator.kill()
+    with pytest.raises(DeviceError, match="can't be stopped and may move"):
+        made.stop()
+    assert not made.robot.armed
+
+
 def test_a_camera_whose_frames_break_the_program_is_told(feed):
     made, _, ends = feed
     made._session.estimator = lambda frame: 1 / 0

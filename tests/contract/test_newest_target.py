@@ -1,12 +1,13 @@
 """Actions that come faster than the arm moves: the newest wins, and what is returned was really sent."""
 
+import threading
 import time
 
 import numpy as np
 import pytest
 from arms import bench, mg400_of
 
-from hardware.arms.arm import PIECE_S
+from hardware.arms.arm import PIECE_S, SimulatedArm
 from hardware.emulators.mg400 import Mg400Emulator
 from hardware.errors import DeviceError
 from hardware.live.lerobot import LeRobotArm
@@ -86,3 +87,22 @@ def test_an_arm_that_fails_on_its_way_is_told_with_the_next_action():
         with pytest.raises(DeviceError, match="alarm 112"):
             robot.send_action({"y": 0.0})
         robot.disconnect()
+
+
+def test_an_error_of_any_kind_in_the_thread_is_told_with_the_next_action():
+    """As of an arm of another package."""
+    robot = LeRobotArm(SimulatedArm(), linear_mm_s=SPEED_MM_S)
+    robot.connect()
+    state = robot.arm.state
+
+    def fail_in_the_thread(**options):
+        if threading.current_thread().name == "newest target":
+            raise OSError("the cable is out")
+        return state(**options)
+
+    robot.send_action({"y": 80.0})
+    robot.arm.state = fail_in_the_thread
+    time.sleep(0.4)
+    with pytest.raises(OSError, match="the cable is out"):
+        robot.send_action({"y": 0.0})
+    robot.disconnect()

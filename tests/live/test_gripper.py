@@ -113,6 +113,15 @@ def test_the_same_loop_with_an_mg400_and_its_digital_output(tmp_path):
         assert len(Session(tmp_path / "left").steps) == len(Session(tmp_path / "right").steps) == 5
 
 
+def test_an_arm_that_can_not_be_stopped_at_the_end_is_an_error():
+    """It is lost with the last motion of the gripper, after which nothing asks it any more."""
+    with Mg400Emulator(port_offset=None, time_scale=4.0) as emulator:
+        hand = SimpleNamespace(name="hand", width_mm=9.0, move=lambda width_mm: width_mm == 1.0 and emulator.kill())
+        rig = GripperRig({"left": NoisyCamera(), "right": NoisyCamera()}, mg400_of(emulator), hand)
+        with pytest.raises(DeviceError, match="stop failed: .*may move.*disable failed"):
+            run_gripper(rig, dict.fromkeys(rig.sources, OnePipeline()), lambda step: (np.zeros(6), 2.0 - step.index), steps=2)
+
+
 def test_a_safe_arm_does_not_move_on_an_old_frame():
     """The policy takes longer than the limits allow a frame to age, though the cameras deliver."""
     with Mg400Emulator(port_offset=None, time_scale=4.0) as emulator:

@@ -13,8 +13,7 @@ from twin.camera.capture import record
 from twin.errors import FrameError
 from twin.frames import open_recording
 from twin.frames.forms import levels_at, raw_to_recording
-from twin.pins import Pipeline, measure_reference, nominal_reference
-from twin.pins.detectors.legacy import LegacyPipeline
+from twin.pins import Pipeline, make_detector, measure_reference, nominal_reference, shipped_detector
 from twin.pins.finding.blobs import SPECK_LEVELS, circular_mask, despeckle, find_blobs
 from twin.pins.labelling.matching import confirm, match, rematch
 from twin.pins.labelling.reference import folded_fraction
@@ -508,10 +507,11 @@ def test_published_method_counts_drawn_pins():
         spec = load_sensor(name)
         rest = nominal_reference(spec, Form.PROCESSED)
         frame = drawn_frame(spec, Form.PROCESSED, rest.pins_px)
-        observation = LegacyPipeline(spec.pins, spec.recording)(frame)
-        assert observation.valid and observation.found == spec.pins.count and len(observation.graph.edges) == edges
+        detect = make_detector(spec, shipped_detector(spec, Form.PROCESSED, "legacy"))
+        observation = detect(frame)
+        assert observation.valid and len(observation.claims_px) == spec.pins.count and len(observation.graph.edges) == edges
         one_less = drawn_frame(spec, Form.PROCESSED, rest.pins_px[1:], radius_px=cap_radii_px(spec, Form.PROCESSED)[1:])
-        assert not LegacyPipeline(spec.pins, spec.recording)(one_less).valid
+        assert not detect(one_less).valid
 
 
 def test_drawn_discs_have_their_centroid():
@@ -590,8 +590,8 @@ def test_a_damaged_frame_names_its_pins_as_the_whole_one(real_dir, name, folder)
 def test_published_method_throws_away_what_it_did(real_dir):
     spec = load_sensor("mg400-331")
     recording = open_recording(real_dir / "tac-vgnn-331", spec)
-    pipeline = LegacyPipeline(spec.pins, spec.recording)
-    found = np.array([pipeline(recording.read(k)).found for k in range(0, len(recording), 10)])
+    detect = make_detector(spec, shipped_detector(spec, Form.PROCESSED, "legacy"))
+    found = np.array([len(detect(recording.read(k)).claims_px) for k in range(0, len(recording), 10)])
     assert 0.01 < np.mean(found != spec.pins.count) < 0.055  # published: 0.032; three standard errors of the sample
 
 

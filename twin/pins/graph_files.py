@@ -11,9 +11,10 @@ from scenes.files import require_regular
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError, OptionError
 from twin.frames import open_recording
-from twin.frames.forms import frame_size, polarity_of
+from twin.frames.forms import frame_size
 from twin.pins.batch import recording_reference
-from twin.pins.detectors.legacy import LegacyPipeline
+from twin.pins.detectors.detector import Detector, make_detector
+from twin.pins.detectors.detector_spec import shipped_detector
 from twin.pins.graph import GraphKind, make_graph
 from twin.pins.labelling.reference import Reference, nominal_reference, spread_out
 from twin.pins.pipeline import Pipeline
@@ -112,10 +113,9 @@ def _graphs_of_recording(
     left_out: list[str] = []
     notes: list[str] = []
     reference, _ = recording_reference(spec, recording, notes)
+    pipeline: Detector | Pipeline = Pipeline(spec, recording.form, reference, graph=kind)
     if legacy:
-        pipeline: LegacyPipeline | Pipeline = LegacyPipeline(spec.pins, spec.recording, polarity=polarity_of(spec.pipeline, recording.form))
-    else:
-        pipeline = Pipeline(spec, recording.form, reference, graph=kind)
+        pipeline = make_detector(spec, shipped_detector(spec, recording.form, "legacy"))
     names: list[str] = []
     graphs: list[PinGraph] = []
     first_image: np.ndarray | None = None

@@ -12,9 +12,8 @@ from twin.errors import FrameError, format_count
 from twin.frames import spread_indices
 from twin.frames.forms import pin_levels, polarity_of
 from twin.geometry.pins import pin_lattice
-from twin.pins.detectors.detector import Found, make_detector
+from twin.pins.detectors.detector import Found, legacy_parameters, make_detector
 from twin.pins.detectors.detector_spec import DetectorSpec, Evidence, Method, with_detector
-from twin.pins.detectors.legacy import legacy_parameters
 from twin.pins.labelling.identify import (
     SAME_SHAPE,
     SHOWN,

@@ -16,7 +16,6 @@ from twin.frames.forms import levels_at, raw_to_recording
 from twin.pins import Pipeline, make_detector, measure_reference, nominal_reference, shipped_detector
 from twin.pins.finding.blobs import SPECK_LEVELS, circular_mask, despeckle, find_blobs
 from twin.pins.labelling.matching import confirm, match, rematch
-from twin.pins.labelling.reference import folded_fraction
 from twin.pins.labelling.split import split_chains
 from twin.pins.pipeline import LEAST_ABOVE, share_between
 from twin.types import Form, Frame
@@ -359,7 +358,7 @@ def test_a_ring_squeezed_around_a_stretched_field_keeps_every_name(name, damage)
             area = np.append(area, np.full(12, 4.0))
         order = rng.permutation(len(px))
         blob = match(rest, px[order], area[order]).blob
-        assert folded_fraction(rest, truth) == 0, "the contact itself is possible"
+        assert rest.folded_fraction(truth) == 0, "the contact itself is possible"
         np.testing.assert_array_equal(np.flatnonzero(blob >= 0), kept, f"pins found at {at}")
         np.testing.assert_array_equal(kept[order[blob[kept]]], kept, f"names at {at}")
 
@@ -404,7 +403,7 @@ def test_exchanged_pins_fold_the_layout():
     rest = nominal_reference(load_sensor("mg400-331"), Form.PROCESSED)
     exchanged = rest.pins_px.copy()
     exchanged[[5, 15]] = exchanged[[15, 5]]
-    assert folded_fraction(rest, rest.pins_px) == 0.0 < folded_fraction(rest, exchanged)
+    assert rest.folded_fraction(rest.pins_px) == 0.0 < rest.folded_fraction(exchanged)
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(2, 4), (3, 2)])

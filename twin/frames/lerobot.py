@@ -96,8 +96,9 @@ class LeRobotFrames:
         for (path, group), part in groupby(sorted(chosen), key=lambda index: self._places[index][:2]):
             index_of = {self._places[index][2]: index for index in part}
             for row, image, time_s in self._from_table(path, group, index_of) if group >= 0 else self._from_video(path, index_of):
-                gray = not isinstance(image, str) and image.ndim == 3 and self._gray
-                yield index_of[row], image[..., 0] if gray else image, time_s
+                if self._gray and not isinstance(image, str) and image.ndim == 3:
+                    image = image[..., 0]
+                yield index_of[row], image, time_s
 
     def _from_video(self, path: Path, rows: Collection[int]) -> Pictures:
         video, found = open_video(path), set()
@@ -110,7 +111,7 @@ class LeRobotFrames:
     def _from_table(self, path: Path, group: int, rows: Collection[int]) -> Pictures:
         for row in rows:
             try:
-                image, note = picture_of(self._encoded(self._cells_of(path, group)[row]))
+                image, note = picture_of(self._picture_bytes(self._cells_of(path, group)[row]))
                 said = f"{self._path.name}: pictures of {self._feature}: {note}"
                 self.problems += [said] if note and said not in self.problems else []
                 yield row, image, 0.0
@@ -125,7 +126,7 @@ class LeRobotFrames:
             raise FrameError(f"{path}: has no column {self._feature}, though {INFO} names it; {DAMAGED}")
         return table.column(self._feature).to_pylist()
 
-    def _encoded(self, cell: Any) -> bytes:
+    def _picture_bytes(self, cell: Any) -> bytes:
         """The encoded bytes of the picture that a cell holds or names."""
         cell = cell if isinstance(cell, dict) else {"bytes": cell}
         if isinstance(cell.get("bytes"), bytes):

@@ -24,14 +24,13 @@ from scenes.sensor import RecordingSpec, SensorSpec
 from twin.camera.capture import record
 from twin.errors import FrameError
 from twin.frames.forms import frame_size, from_raw, gray_levels, pin_levels, recording_to_raw, times
-from twin.pins.detectors.detector_spec import OWN, DetectorSpec, with_detector
-from twin.pins.detectors.own_finder import own_places
+from twin.pins.detectors.detector_spec import OWN, DetectorSpec, own_places, with_detector
 from twin.pins.finding.blobs import Mask, circular_mask, threshold
-from twin.pins.flips import directed_edges
 from twin.pins.graph import make_graph
 from twin.pins.labelling.matching import match
 from twin.pins.labelling.reference import Reference, nominal_reference
 from twin.pins.pipeline import MIN_FOUND, Pipeline
+from twin.pins.voronoi import directed_edges
 from twin.types import Form, Frame, PinGraph
 
 LEVELS = 255.0

@@ -598,7 +598,7 @@ def _trust(layout: LayoutArrays, px: np.ndarray, blob: np.ndarray) -> tuple[np.n
     """Positions (N, 2) of the pairs, and their weights (N,), which decrease with the distance from the place predicted by neighbours."""
     moved, weight = px[blob], (blob >= 0).astype(float)
     away2 = ((predict_all(layout, moved, weight) - moved) ** 2).sum(axis=1)
-    return moved, np.nan_to_num(weight / (1 + away2 / (SOFT_RESIDUAL * layout.spacing) ** 2))
+    return moved, np.fmax(weight / (1 + away2 / (SOFT_RESIDUAL * layout.spacing) ** 2), 0.0)  # 0 without a prediction
 
 
 @compiled()

@@ -12,7 +12,7 @@ from scenes.base import SpecError
 from scenes.object import ObjectSpec
 from scenes.sensor import SensorSpec
 from twin.camera.capture import expose, in_form
-from twin.camera.truth import CapTruth, cap_truth, segment_distance
+from twin.camera.projection import CapTruth, cap_truth, segment_distance
 from twin.compiled import begin_compiling
 from twin.errors import ContactError, FrameError, OptionError
 from twin.frames.forms import form_named, frame_size

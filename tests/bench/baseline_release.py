@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import Delaunay, Voronoi
 
 from scenes.sensor import SensorSpec
-from twin.pins.detectors.legacy import LEGACY, boundary_nodes, legacy_detector
+from twin.pins.detectors.detector import LEGACY, boundary_nodes, legacy_detector
 
 
 def polygon_area(vertices: np.ndarray) -> float:

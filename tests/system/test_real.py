@@ -12,9 +12,8 @@ from twin.frames import open_recording
 from twin.frames.forms import recording_to_raw
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
-from twin.pins import Pipeline, nominal_reference
+from twin.pins import Pipeline, make_detector, nominal_reference, shipped_detector
 from twin.pins.batch import recording_reference
-from twin.pins.detectors.legacy import LegacyPipeline
 from twin.rig.labels import read_arm_labels
 from twin.simulator import Simulator
 from twin.types import Form
@@ -69,8 +68,8 @@ def test_legacy_throws_away_what_the_release_does(real_dir):
     recording = open_recording(real_dir / "tac-vgnn-331", spec)
     if len(recording) != 3763:
         pytest.skip(f"the figure is for the 3763 frames of the usual split, not for {len(recording)}")
-    pipeline = LegacyPipeline(spec.pins, spec.recording)
-    assert sum(not pipeline(frame).valid for frame in recording) == 101
+    detect = make_detector(spec, shipped_detector(spec, Form.PROCESSED, "legacy"))
+    assert sum(not detect(frame).valid for frame in recording) == 101
 
 
 def displacement_by_depth(labels, pins_px, rest_px):

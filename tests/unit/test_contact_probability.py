@@ -12,7 +12,7 @@ from training.models import part
 from training.models.part import Unseen
 from training.models.touch.model import TOUCH
 from training.touch.contact_probability import TouchAnswer
-from twin.camera.truth import cap_truth
+from twin.camera.projection import cap_truth
 from twin.geometry.solid import Resolution
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver

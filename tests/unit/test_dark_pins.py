@@ -16,9 +16,8 @@ from twin.evaluation.degradation.conditions.body import faded, missing, pale
 from twin.frames.forms import is_two_level
 from twin.optics.preview import Preview
 from twin.optics.surfaces import cap_albedo
-from twin.pins import Pipeline
+from twin.pins import Pipeline, make_detector, shipped_detector
 from twin.pins.check import Grade, examine
-from twin.pins.detectors.legacy import LegacyPipeline
 from twin.pins.detectors.tune import _at_rest, tune
 from twin.pins.finding.caps import measure_caps
 from twin.pins.labelling.identify import LayoutInFrame, _at_likelier_spots, identify, score_layout
@@ -173,7 +172,7 @@ def test_degraded_dark_caps_become_like_the_skin():
 
 def test_the_published_method_refuses_dark_pins():
     with pytest.raises(FrameError, match="bright pins only"):
-        LegacyPipeline(GRID, None, polarity="dark")
+        make_detector(sensor_of(), shipped_detector(sensor_of(), Form.RAW, "legacy"))
 
 
 def test_pins_at_the_same_place_are_an_error_in_words_not_a_division_by_zero():

@@ -15,7 +15,7 @@ from twin.errors import FrameError, OptionError
 from twin.frames.forms import known_sizes
 from twin.geometry.pins import pin_lattice
 from twin.pins import METHODS, load_detector, make_detector, shipped_detector, write_detector
-from twin.pins.detectors.own_finder import own_detector, own_name, own_places
+from twin.pins.detectors.detector_spec import own_detector, own_name, own_places
 from twin.pins.detectors.tune import tune
 from twin.pins.detectors.tune_files import tune_on_frames
 from twin.pins.labelling.reference import nominal_reference

@@ -10,7 +10,7 @@ from plain_sensor import changed, plain
 
 from hardware.live.examining import examine_sensor
 from scenes import load_sensor
-from twin.camera.truth import cap_truth
+from twin.camera.projection import cap_truth
 from twin.evaluation.degradation.condition import DegradedCase
 from twin.evaluation.degradation.conditions import CONDITIONS
 from twin.evaluation.degradation.shots import CONTACTS, ObjectContact, RenderedSource, pins_under

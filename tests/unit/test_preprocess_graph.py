@@ -10,9 +10,8 @@ from scipy.spatial import Voronoi
 from scenes import load_sensor
 from twin.frames.forms import from_raw, recording_to_raw
 from twin.pins import make_graph, node_features, nominal_reference
-from twin.pins.detectors.legacy import LEGACY, legacy_graph
-from twin.pins.flips import directed_edges
-from twin.pins.voronoi import triangulate, voronoi
+from twin.pins.detectors.detector import LEGACY, legacy_graph
+from twin.pins.voronoi import directed_edges, triangulate, voronoi
 from twin.types import Form
 
 TILING = 1e-9  # relative: rounding of some hundred polygon cuts

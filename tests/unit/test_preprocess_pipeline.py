@@ -13,11 +13,9 @@ from twin.camera.capture import record
 from twin.errors import FrameError
 from twin.frames import open_recording
 from twin.frames.forms import levels_at, raw_to_recording
-from twin.pins import Pipeline, measure_reference, nominal_reference
-from twin.pins.detectors.legacy import LegacyPipeline
+from twin.pins import Pipeline, make_detector, measure_reference, nominal_reference, shipped_detector
 from twin.pins.finding.blobs import SPECK_LEVELS, circular_mask, despeckle, find_blobs
 from twin.pins.labelling.matching import confirm, match, rematch
-from twin.pins.labelling.reference import folded_fraction
 from twin.pins.labelling.split import split_chains
 from twin.pins.pipeline import LEAST_ABOVE, share_between
 from twin.types import Form, Frame
@@ -360,7 +358,7 @@ def test_a_ring_squeezed_around_a_stretched_field_keeps_every_name(name, damage)
             area = np.append(area, np.full(12, 4.0))
         order = rng.permutation(len(px))
         blob = match(rest, px[order], area[order]).blob
-        assert folded_fraction(rest, truth) == 0, "the contact itself is possible"
+        assert rest.folded_fraction(truth) == 0, "the contact itself is possible"
         np.testing.assert_array_equal(np.flatnonzero(blob >= 0), kept, f"pins found at {at}")
         np.testing.assert_array_equal(kept[order[blob[kept]]], kept, f"names at {at}")
 
@@ -405,7 +403,7 @@ def test_exchanged_pins_fold_the_layout():
     rest = nominal_reference(load_sensor("mg400-331"), Form.PROCESSED)
     exchanged = rest.pins_px.copy()
     exchanged[[5, 15]] = exchanged[[15, 5]]
-    assert folded_fraction(rest, rest.pins_px) == 0.0 < folded_fraction(rest, exchanged)
+    assert rest.folded_fraction(rest.pins_px) == 0.0 < rest.folded_fraction(exchanged)
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(2, 4), (3, 2)])
@@ -508,10 +506,11 @@ def test_published_method_counts_drawn_pins():
         spec = load_sensor(name)
         rest = nominal_reference(spec, Form.PROCESSED)
         frame = drawn_frame(spec, Form.PROCESSED, rest.pins_px)
-        observation = LegacyPipeline(spec.pins, spec.recording)(frame)
-        assert observation.valid and observation.found == spec.pins.count and len(observation.graph.edges) == edges
+        detect = make_detector(spec, shipped_detector(spec, Form.PROCESSED, "legacy"))
+        observation = detect(frame)
+        assert observation.valid and len(observation.claims_px) == spec.pins.count and len(observation.graph.edges) == edges
         one_less = drawn_frame(spec, Form.PROCESSED, rest.pins_px[1:], radius_px=cap_radii_px(spec, Form.PROCESSED)[1:])
-        assert not LegacyPipeline(spec.pins, spec.recording)(one_less).valid
+        assert not detect(one_less).valid
 
 
 def test_drawn_discs_have_their_centroid():
@@ -590,8 +589,8 @@ def test_a_damaged_frame_names_its_pins_as_the_whole_one(real_dir, name, folder)
 def test_published_method_throws_away_what_it_did(real_dir):
     spec = load_sensor("mg400-331")
     recording = open_recording(real_dir / "tac-vgnn-331", spec)
-    pipeline = LegacyPipeline(spec.pins, spec.recording)
-    found = np.array([pipeline(recording.read(k)).found for k in range(0, len(recording), 10)])
+    detect = make_detector(spec, shipped_detector(spec, Form.PROCESSED, "legacy"))
+    found = np.array([len(detect(recording.read(k)).claims_px) for k in range(0, len(recording), 10)])
     assert 0.01 < np.mean(found != spec.pins.count) < 0.055  # published: 0.032; three standard errors of the sample
 
 

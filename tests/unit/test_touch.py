@@ -14,7 +14,7 @@ from twin.geometry.solid import Resolution
 from twin.mechanics.path import ContactPose
 from twin.mechanics.solver import SkinSolver
 from twin.pins import Pipeline, make_reference, measure_reference, nominal_reference, view_of
-from twin.pins.labelling.view import camera_modes
+from twin.pins.labelling.reference import camera_modes
 from twin.rig.labels import read_arm_labels
 from twin.types import Form
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from scenes import load_sensor
-from twin.camera.truth import cap_truth, find_occluded, segment_distance
+from twin.camera.projection import cap_truth, find_occluded, segment_distance
 from twin.geometry.pins import rest_pins
 from twin.types import ContactState, Form
 

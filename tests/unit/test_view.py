@@ -24,7 +24,7 @@ from twin.mechanics.solver import SkinSolver
 from twin.pins import Pipeline, make_reference, measure_reference, nominal_reference, view_of
 from twin.pins.check import Grade, examine
 from twin.pins.labelling.identify import symmetries
-from twin.pins.labelling.view import MOST_TURN_DEG
+from twin.pins.labelling.reference import MOST_TURN_DEG
 from twin.rig.labels import read_arm_labels
 from twin.types import Form, Frame
 

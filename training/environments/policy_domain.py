@@ -15,7 +15,7 @@ from training.estimate.domain import Domain, domain_arrays, domain_of, learn_dom
 from training.estimate.estimator import PoseEstimator
 from training.runs.run_files import shipped_names
 from twin.pins import Reference, nominal_reference, view_of
-from twin.pins.labelling.view import camera_modes
+from twin.pins.labelling.reference import camera_modes
 from twin.policy import Displacements, Policy, PolicyError
 from twin.types import BoolArray, FloatArray, Form
 

@@ -189,7 +189,7 @@ class PoseEstimator:
         ------
         FrameError
             The frame shows a contact, or not this sensor, or the camera's picture is displaced so far that estimates would be wrong
-            (``twin.pins.labelling.view``); or the model does not count pins from rest.
+            (``twin.pins.labelling.reference``); or the model does not count pins from rest.
 
         Notes
         -----

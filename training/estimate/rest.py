@@ -32,7 +32,7 @@ from twin.errors import FrameError
 from twin.estimate import Estimate, SensorModel
 from twin.frames import spread_indices
 from twin.pins import PinView, Reference, make_reference, measure_reference, view_of
-from twin.pins.labelling.view import camera_modes
+from twin.pins.labelling.reference import camera_modes
 from twin.store import ArrayFile
 from twin.types import Form, Frame, Observation
 
@@ -266,7 +266,7 @@ class RestPlaces:
         ------
         FrameError
             The frame shows a contact, or not this sensor, or the camera's picture is displaced so far that estimates would be wrong
-            (``twin.pins.labelling.view``).
+            (``twin.pins.labelling.reference``).
         """
         reference = measure_reference(self.sensor, self.form, frame, known=self.known)
         return reference, self.require_view(reference.pins_px, frame.name or "frame").describe_ambiguity()

@@ -9,7 +9,7 @@ import numpy as np
 
 from scenes.sensor import SensorSpec
 from training.generation.config import DatasetError, Draw, GenerationConfig, draw_contact
-from twin.camera.truth import cap_truth
+from twin.camera.projection import cap_truth
 from twin.errors import ContactError, MeshError
 from twin.frames.forms import gray_levels
 from twin.geometry.solid import Resolution

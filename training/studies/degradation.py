@@ -33,7 +33,7 @@ class DegradationPlan:
     ----------
     sensor : SensorSpec
     pipelines : tuple of str
-        Methods, files of 'twin tune', or functions of yours as ``FILE.py:FUNCTION`` (``twin.pins.detectors.own_finder``).
+        Methods, files of 'twin tune', or functions of yours as ``FILE.py:FUNCTION`` (``twin.pins.detectors.detector_spec``).
     models : tuple of Path
         Folders of runs.
     sweep : SweepPlan

@@ -10,8 +10,8 @@ with its neighbours', and the largest average, a (px), gives the probability (at
 import numpy as np
 
 from training.models.vgnn.registration import align
-from twin.pins.flips import directed_edges
 from twin.pins.labelling.reference import Reference
+from twin.pins.voronoi import directed_edges
 from twin.types import BoolArray, FloatArray
 
 MIDDLE_PX = 0.28

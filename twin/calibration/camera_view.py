@@ -19,9 +19,8 @@ from twin.frames import open_recording
 from twin.frames.forms import from_raw, gray_levels
 from twin.geometry.pins import rest_pins
 from twin.pins.labelling.identify import SHOWN, score_layout
-from twin.pins.labelling.reference import make_reference, project_rest
+from twin.pins.labelling.reference import PinView, camera_modes, make_reference, project_rest, views_of
 from twin.pins.labelling.rest import require_even
-from twin.pins.labelling.view import PinView, camera_modes, views_of
 from twin.pins.pipeline import Pipeline
 from twin.types import Form, Frame
 

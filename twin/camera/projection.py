@@ -13,7 +13,8 @@ x_d = x (1 + k1 r^2 + k2 r^4) + 2 p1 x y + p2 (r^2 + 2 x^2),
 y_d = y (1 + k1 r^2 + k2 r^4) + p1 (r^2 + 2 y^2) + 2 p2 x y;
 or fisheye (Kannala and Brandt 2006), where the radius is theta (1 + k1 theta^2 + k2 theta^4).
 
-`lens_disc` gives the part of the raw frame that shows the gel: the housing's aperture.
+`lens_disc` gives the part of the raw frame that shows the gel: the housing's aperture. `cap_truth` gives the exact truth of a
+rendered contact: the place of every cap in space and in the frame.
 """
 
 from dataclasses import dataclass, replace
@@ -24,8 +25,8 @@ import numpy as np
 
 from scenes.sensor import CameraSpec, HousingSpec, SensorSpec, ViewSpec
 from twin.compiled import compiled
-from twin.frames.forms import from_raw
-from twin.types import FloatArray, Form
+from twin.frames.forms import frame_size, from_raw
+from twin.types import BoolArray, FloatArray, Form, PinState
 
 NEWTON_STEPS = 12
 """Steps of Newton's method. It converges quadratically, so the last steps change only the last digits."""
@@ -224,3 +225,73 @@ def _fisheye(camera: CameraSpec, angle: FloatArray) -> FloatArray:
 def cross_plane(a: FloatArray, b: FloatArray) -> FloatArray:
     """The third component of the cross product of vectors (..., 2) in a plane."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+@dataclass(frozen=True)
+class CapTruth:
+    """Caps of one contact, in the specification's pin order.
+
+    Attributes
+    ----------
+    caps_mm : (N, 3) float
+        Cap centres, sensor frame.
+    caps_px, rest_px : (N, 2) float
+        Projections of the cap centres in px of the frame, in the contact and at rest.
+    visible : (N,) bool
+        The cap's centre is inside the frame, and the line of sight to it meets no other pin.
+    """
+
+    caps_mm: FloatArray
+    caps_px: FloatArray
+    rest_px: FloatArray
+    visible: BoolArray
+
+
+def cap_truth(spec: SensorSpec, rest: PinState, state: PinState, form: Form) -> CapTruth:
+    """Ground truth of a contact for frames of the given form."""
+    caps_px = project_in_form(spec, form, state.caps_mm)
+    rest_px = project_in_form(spec, form, rest.caps_mm)
+    inside = np.all((caps_px >= -0.5) & (caps_px <= np.array(frame_size(spec, form)) - 0.5), axis=1)
+    return CapTruth(state.caps_mm, caps_px, rest_px, inside & ~find_occluded(spec.view, 0.5 * spec.pins.cap_diameter_mm, state))
+
+
+def find_occluded(view: ViewSpec, cap_radius_mm: float, state: PinState) -> BoolArray:
+    """(N,) bool: the ray in the gel from the window to the cap's centre passes through another pin.
+
+    Each pin is approximated by a capsule of the cap's radius around the axis from foot to cap.
+    """
+    window_mm, _ = pixel_rays(view, project(view, state.caps_mm))
+    return _meets_another(window_mm, state.base_mm, state.caps_mm, cap_radius_mm)
+
+
+@compiled()
+def _meets_another(eyes: FloatArray, base: FloatArray, caps: FloatArray, radius: float) -> BoolArray:
+    """(N,) bool: the segment from ``eyes`` to ``caps``, (N, 3) each, comes nearer than ``radius`` to another pin's axis."""
+    hidden = np.zeros(len(caps), np.bool_)
+    for i in range(len(caps)):
+        for j in range(len(caps)):
+            if j != i and segment_distance(eyes[i], caps[i], base[j], caps[j]) < radius:
+                hidden[i] = True
+                break
+    return hidden
+
+
+@compiled()
+def segment_distance(p0: FloatArray, p1: FloatArray, q0: FloatArray, q1: FloatArray) -> float:
+    """Distance of the segment p0-p1 to the segment q0-q1, (3,) each (Ericson 2004, 5.1.9)."""
+    a = b = c = e = f = 0.0
+    for k in range(3):
+        d1, d2, r = p1[k] - p0[k], q1[k] - q0[k], p0[k] - q0[k]
+        a += d1 * d1
+        b += d1 * d2
+        c += d1 * r
+        e += d2 * d2
+        f += d2 * r
+    denominator = a * e - b * b
+    s = (b * f - c * e) / denominator if denominator > 1e-12 else 0.0
+    t = min(max((b * min(max(s, 0.0), 1.0) + f) / e, 0.0), 1.0)
+    s = min(max((t * b - c) / a, 0.0), 1.0)
+    square = 0.0
+    for k in range(3):
+        square += (p0[k] - q0[k] + s * (p1[k] - p0[k]) - t * (q1[k] - q0[k])) ** 2
+    return np.sqrt(square)

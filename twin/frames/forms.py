@@ -14,7 +14,7 @@ import numpy as np
 
 from scenes.sensor import BlobSpec, PipelineSpec, Polarity, RecordingSpec, SensorSpec
 from twin.errors import ErrorsAs, FrameError
-from twin.frames.images import bits_used, decode, to_eight_bits
+from twin.frames.images import bits_used, read_levels, to_eight_bits
 from twin.types import Form
 
 # Share of black and white pixels above which a frame counts as thresholded. It is below 1, because resizing leaves gray edges.
@@ -233,7 +233,7 @@ def common_kind(files: list[Path], spec: SensorSpec | None, form: Form | None) -
     reasons: dict[int, str] = {}
     for k in [*spread, *(k for k in range(len(files)) if k not in spread)]:
         try:
-            stored = decode(files[k])
+            stored, _ = read_levels(files[k])
             votes[k] = FrameKind(form_of(to_eight_bits(stored)[0], files[k].name, spec, form), _size_px(stored), bits_used(stored))
         except FrameError as error:
             reasons[k] = str(error)

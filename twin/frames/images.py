@@ -65,7 +65,7 @@ def read_image(path: Path, bits: int = 0) -> tuple[np.ndarray, str]:
     FrameError
         The file cannot be read: it is missing, empty, truncated, damaged or no picture.
     """
-    return _as_levels(*_read_levels(path), bits)
+    return _as_levels(*read_levels(path), bits)
 
 
 def picture_of(data: bytes) -> tuple[np.ndarray, str]:
@@ -103,19 +103,16 @@ def png(image: np.ndarray) -> bytes:
     return cv2.imencode(".png", image if image.ndim == 2 else image[..., ::-1])[1].tobytes()
 
 
-def decode(path: Path) -> np.ndarray:
-    """Levels of a picture as stored, (H, W) or (H, W, C) in OpenCV's channel order, uint8 or uint16.
+def read_levels(path: Path) -> tuple[np.ndarray, str]:
+    """Levels of a picture as stored, and a note on irregularities of the file ("" if there are none).
+
+    The levels are (H, W) or (H, W, C) in OpenCV's channel order, uint8 or uint16.
 
     Raises
     ------
     FrameError
         The file cannot be read: it is missing, empty, truncated, damaged or no picture.
     """
-    return _read_levels(path)[0]
-
-
-def _read_levels(path: Path) -> tuple[np.ndarray, str]:
-    """Levels as of ``decode``, and a note on irregularities of the file ("" if there are none)."""
     with ErrorsAs(OSError, lambda error: FrameError(f"{path.name}: can't be read ({error.strerror})")):
         data = read_regular(path, LARGEST_BYTES)
     if not data:
@@ -127,7 +124,7 @@ def _read_levels(path: Path) -> tuple[np.ndarray, str]:
 
 
 def _decode_picture(data: bytes) -> tuple[np.ndarray, str]:
-    """Levels as of ``decode`` from a picture's bytes, and a note on irregularities that its decoder reported ("" if there are none)."""
+    """Levels as of `read_levels` from a picture's bytes, and a note on irregularities that its decoder reported ("" if there are none)."""
     orientation, place = _orientation(data)
     if place and data[:4] in TIFF_STARTS:  # OpenCV turns TIFF pictures, whatever it is told
         data = data[:place] + struct.pack(f"{TIFF_STARTS[data[:4]]}H", UPRIGHT) + data[place + 2 :]

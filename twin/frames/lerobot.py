@@ -4,9 +4,11 @@ Each number of a feature becomes a column, named after the feature and the numbe
 """
 
 import json
+import math
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from scenes.files import read_regular
 from twin.errors import ErrorsAs, FrameError, library
 from twin.frames.images import picture_of
 from twin.frames.tables import LARGEST_BYTES, called_here
-from twin.frames.videos import open_video
+from twin.frames.videos import Pictures, open_video
 
 INFO, DATA, EPISODES = Path("meta", "info.json"), "data/chunk-*/*.parquet", "meta/episodes/chunk-*/*.parquet"
 """Paths of a data set's description, of its tables of frames and of its tables of episodes."""
@@ -36,9 +38,10 @@ DAMAGED = "give the complete data set"
 Episode = dict[str, Any]
 
 
-@dataclass
 class LeRobotFrames:
     """Frames of a data set, each read when it is needed.
+
+    Of a data set that is still being written, only the episodes that its description counts are read.
 
     Attributes
     ----------
@@ -48,113 +51,96 @@ class LeRobotFrames:
     labels : dict of str to (M,) float
     problems : list of str
         Irregularities, one line each.
-    """
-
-    path: Path
-    names: list[str]
-    labels: dict[str, np.ndarray]
-    problems: list[str]
-    first: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.uint8))
-    _places: list[tuple[Path, int, int]] = field(
-        default_factory=list, repr=False
-    )  # of each frame: file, row group (-1 for a video), and row or frame number in it
-    _feature: str = field(default="", repr=False)
-    _group: tuple[Path, int] | None = field(default=None, repr=False)
-    _cells: list[Any] = field(default_factory=list, repr=False)
-
-    def frames(self, chosen: Collection[int]) -> Iterator[tuple[int, np.ndarray | str]]:
-        """Index and picture of chosen frames, in order. A damaged frame gives the reason, a text, instead of the picture."""
-        wanted = sorted(chosen)
-        if wanted and self._places[wanted[0]][1] < 0:
-            yield from self._from_videos(wanted)
-            return
-        for index in wanted:
-            try:
-                image, note = picture_of(self._read_encoded(*self._places[index]))
-                said = f"{self.path.name}: pictures of {self._feature}: {note}"
-                self.problems += [said] if note and said not in self.problems else []
-                yield index, self._as_first(image)
-            except FrameError as error:
-                yield index, str(error)
-
-    def _from_videos(self, wanted: list[int]) -> Iterator[tuple[int, np.ndarray | str]]:
-        for path in dict.fromkeys(self._places[index][0] for index in wanted):
-            number = {self._places[index][2]: index for index in wanted if self._places[index][0] == path}
-            video = open_video(path)
-            self.problems += [problem for problem in video.problems if problem not in self.problems]
-            for k, _, image in video.frames():
-                if k in number:
-                    yield number.pop(k), image if isinstance(image, str) else self._as_first(image)
-                if not number:
-                    break
-            for index in number.values():
-                yield index, f"{path.name} ends before it"
-
-    def _read_encoded(self, path: Path, group: int, row: int) -> bytes:
-        """The encoded bytes of a picture that a table holds or names."""
-        if self._group != (path, group):
-            with _parquet(path) as file:
-                table = file.read_row_group(group, [self._feature])
-            if self._feature not in table.column_names:
-                raise FrameError(f"{path}: has no column {self._feature}, though {INFO} names it; {DAMAGED}")
-            self._group, self._cells = (path, group), table.column(self._feature).to_pylist()
-        cell = self._cells[row]
-        data = cell.get("bytes") if isinstance(cell, dict) else cell
-        if isinstance(data, bytes):
-            return data
-        named = cell.get("path") if isinstance(cell, dict) else None
-        if not named:
-            raise FrameError("no picture in its row")
-        with ErrorsAs(OSError, lambda error: FrameError(f"{named}: can't be read ({error.strerror})")):
-            return read_regular(self.path / named, LARGEST_BYTES)
-
-    def _as_first(self, image: np.ndarray) -> np.ndarray:
-        return image[..., 0] if image.ndim == 3 and self.first.ndim == 2 and self.first.size else image
-
-
-def is_lerobot(path: Path) -> bool:
-    """Whether a folder is a LeRobot data set."""
-    return (path / INFO).is_file()
-
-
-def open_lerobot(path: Path) -> LeRobotFrames:
-    """Open a data set. Of a data set that is still being written, only the episodes that its description counts are read.
 
     Raises
     ------
     FrameError
         It has another version, is damaged or has no pictures; or pyarrow is missing.
     """
-    info = _info(path)
-    library("pyarrow.parquet")
-    problems: list[str] = []
-    features: dict[str, dict[str, Any]] = {name: each for name, each in info["features"].items() if isinstance(each, dict)}
-    pictured = [name for name, each in features.items() if each.get("dtype") in PICTURES]
-    if not pictured:
-        raise FrameError(f"{path}: a LeRobot data set without pictures ({', '.join(list(features)[:5])}); give one with a camera's frames")
-    feature = next((name for name in pictured if any(word in name.lower() for word in OURS)), pictured[0])
-    if len(pictured) > 1:
-        problems.append(f"{path.name}: read {feature}, not {', '.join(name for name in pictured if name != feature)}")
-    numbered = [name for name, each in features.items() if str(each.get("dtype")).startswith(NUMBERS) and name not in COUNTERS]
-    rows, places = _rows(path, info, numbered)
-    if not places:
-        raise FrameError(f"{path}: a LeRobot data set without frames; {DAMAGED}")
-    if features[feature]["dtype"] == "video":
-        places = _in_videos(path, info, feature, rows)
-    labels: dict[str, np.ndarray] = {}
-    for name in numbered:
-        labels |= _columns(name, features[name].get("names"), rows[name])
-    labels = called_here(labels)
-    names = [f"episode-{e:06d}-frame-{k:06d}" for e, k in zip(rows["episode_index"], rows["frame_index"], strict=True)]
-    found = LeRobotFrames(path, names, labels, problems, _places=places, _feature=feature)
-    reason = ""
-    for _, image in found.frames(range(len(names))):
-        if not isinstance(image, str):
-            alike = image.ndim == 3 and bool((image == image[..., :1]).all())
-            found.first = image[..., 0] if alike else image
-            return found
-        reason = reason or image
-    raise FrameError(f"{path}: no picture of {feature} can be read ({reason}); {DAMAGED}")
+
+    def __init__(self, path: Path) -> None:
+        info = _info(path)
+        library("pyarrow.parquet")
+        features: dict[str, dict[str, Any]] = {name: each for name, each in info["features"].items() if isinstance(each, dict)}
+        pictured = [name for name, each in features.items() if each.get("dtype") in PICTURES]
+        if not pictured:
+            named = ", ".join(list(features)[:5])
+            raise FrameError(f"{path}: a LeRobot data set without pictures ({named}); give one with a camera's frames")
+        feature = next((name for name in pictured if any(word in name.lower() for word in OURS)), pictured[0])
+        others = [name for name in pictured if name != feature]
+        self.problems = [f"{path.name}: read {feature}, not {', '.join(others)}"] if others else []
+        numbered = [name for name, each in features.items() if str(each.get("dtype")).startswith(NUMBERS) and name not in COUNTERS]
+        rows, places = _rows(path, info, numbered)
+        if not places:
+            raise FrameError(f"{path}: a LeRobot data set without frames; {DAMAGED}")
+        if features[feature]["dtype"] == "video":
+            places = _in_videos(path, info, feature, rows)
+        labels: dict[str, np.ndarray] = {}
+        for name in numbered:
+            labels |= _columns(name, features[name].get("names"), rows[name])
+        self.labels = called_here(labels)
+        self.names = [f"episode-{e:06d}-frame-{k:06d}" for e, k in zip(rows["episode_index"], rows["frame_index"], strict=True)]
+        self._path, self._feature, self._places, self._gray = path, feature, places, False
+        self._cells_of = lru_cache(maxsize=1)(self._read_cells)
+        reason = ""
+        for _, image, _ in self.frames(range(len(places))):
+            if not isinstance(image, str):
+                self._gray = image.ndim == 3 and bool((image == image[..., :1]).all())
+                self.first = image[..., 0] if self._gray else image
+                return
+            reason = reason or image
+        raise FrameError(f"{path}: no picture of {feature} can be read ({reason}); {DAMAGED}")
+
+    def frames(self, chosen: Collection[int]) -> Pictures:
+        """Pictures of chosen frames, in order."""
+        for (path, group), part in groupby(sorted(chosen), key=lambda index: self._places[index][:2]):
+            index_of = {self._places[index][2]: index for index in part}
+            for row, image, time_s in self._from_table(path, group, index_of) if group >= 0 else self._from_video(path, index_of):
+                if self._gray and not isinstance(image, str) and image.ndim == 3:
+                    image = image[..., 0]
+                yield index_of[row], image, time_s
+
+    def _from_video(self, path: Path, rows: Collection[int]) -> Pictures:
+        video, found = open_video(path), set()
+        self.problems += [problem for problem in video.problems if problem not in self.problems]
+        for row, image, _ in video.frames(rows):
+            found.add(row)
+            yield row, image, 0.0
+        yield from ((row, f"{path.name} ends before it", 0.0) for row in rows if row not in found)
+
+    def _from_table(self, path: Path, group: int, rows: Collection[int]) -> Pictures:
+        for row in rows:
+            try:
+                image, note = picture_of(self._picture_bytes(self._cells_of(path, group)[row]))
+                said = f"{self._path.name}: pictures of {self._feature}: {note}"
+                self.problems += [said] if note and said not in self.problems else []
+                yield row, image, 0.0
+            except FrameError as error:
+                yield row, str(error), 0.0
+
+    def _read_cells(self, path: Path, group: int) -> list[Any]:
+        """The cells that hold or name the pictures of a table's row group."""
+        with _parquet(path) as file:
+            table = file.read_row_group(group, [self._feature])
+        if self._feature not in table.column_names:
+            raise FrameError(f"{path}: has no column {self._feature}, though {INFO} names it; {DAMAGED}")
+        return table.column(self._feature).to_pylist()
+
+    def _picture_bytes(self, cell: Any) -> bytes:
+        """The encoded bytes of the picture that a cell holds or names."""
+        cell = cell if isinstance(cell, dict) else {"bytes": cell}
+        if isinstance(cell.get("bytes"), bytes):
+            return cell["bytes"]
+        named = cell.get("path")
+        if not named:
+            raise FrameError("no picture in its row")
+        with ErrorsAs(OSError, lambda error: FrameError(f"{named}: can't be read ({error.strerror})")):
+            return read_regular(self._path / named, LARGEST_BYTES)
+
+
+def is_lerobot(path: Path) -> bool:
+    """Whether a folder is a LeRobot data set."""
+    return (path / INFO).is_file()
 
 
 def _info(path: Path) -> dict[str, Any]:
@@ -175,7 +161,8 @@ def _rows(path: Path, info: dict[str, Any], numbered: list[str]) -> tuple[dict[s
     columns = ["episode_index", "frame_index", *numbered]
     rows: dict[str, list[Any]] = {name: [] for name in columns}
     places: list[tuple[Path, int, int]] = []
-    total = info.get("total_episodes")
+    counted = info.get("total_episodes")
+    total = counted if isinstance(counted, int) else math.inf
     for file in sorted(path.glob(DATA)):
         with _parquet(file) as parquet:
             tables = [parquet.read_row_group(group, columns) for group in range(parquet.num_row_groups)]
@@ -183,12 +170,10 @@ def _rows(path: Path, info: dict[str, Any], numbered: list[str]) -> tuple[dict[s
             if missing := [name for name in columns if name not in table.column_names]:
                 raise FrameError(f"{file}: has no column {', '.join(missing[:3])}, though {INFO} names it; {DAMAGED}")
             cells = {name: table.column(name).to_pylist() for name in columns}
-            for k, episode in enumerate(cells["episode_index"]):
-                if isinstance(total, int) and episode >= total:
-                    continue
-                places.append((file, group, k))
-                for name in columns:
-                    rows[name].append(cells[name][k])
+            kept = [k for k, episode in enumerate(cells["episode_index"]) if episode < total]
+            places += [(file, group, k) for k in kept]
+            for name in columns:
+                rows[name] += [cells[name][k] for k in kept]
     return rows, places
 
 

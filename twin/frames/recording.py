@@ -1,7 +1,7 @@
 """Opens a recording from a picture, a folder, a video or a data set, and reads it frame by frame."""
 
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypedDict
@@ -14,9 +14,9 @@ from twin.errors import FrameError
 from twin.frames.folders import IMAGE_FOLDERS, VIDEO_SUFFIXES, frames_in, image_folders, odd_entries, references_in, the_video_in
 from twin.frames.forms import FrameKind, common_kind, form_named, form_of, times
 from twin.frames.images import read_image
-from twin.frames.lerobot import INFO, RESTS, LeRobotFrames, is_lerobot, open_lerobot
+from twin.frames.lerobot import INFO, RESTS, LeRobotFrames, is_lerobot
 from twin.frames.tables import TABLES, describe_count, order_by_table, read_metadata, unlikely_units
-from twin.frames.videos import Video, open_video
+from twin.frames.videos import Pictures, open_video
 from twin.types import Form, Frame
 
 MOST_NAMED = 20  # most columns that a message names; the widest tables in use have about 40
@@ -91,8 +91,7 @@ class Recording:
     problems: list[str] = field(default_factory=list)
     failed: list[BadFrame] = field(default_factory=list)
     _files: list[Path] = field(default_factory=list, repr=False)
-    _video: Video | None = field(default=None, repr=False)
-    _dataset: LeRobotFrames | None = field(default=None, repr=False)
+    _pictures: Callable[[Collection[int]], Pictures] | None = field(default=None, repr=False)
     _bits: int = field(default=0, repr=False)
     _noted: set[str] = field(default_factory=set, repr=False)
 
@@ -150,7 +149,7 @@ class Recording:
     def _read_chosen(self, chosen: Collection[int]) -> Iterator[tuple[int, Frame | str]]:
         """Index and frame, or the reason why it can't be read, of chosen frames of any source."""
         expected = tuple(self.size_px)
-        for index, image, time_s in self._images(chosen):
+        for index, image, time_s in (self._pictures or self._from_files)(chosen):
             if isinstance(image, str):
                 yield index, image.removeprefix(f"{self.names[index]}: ")
             elif (got := image.shape[1::-1]) != expected:
@@ -159,18 +158,12 @@ class Recording:
             else:
                 yield index, Frame(image, self.form, self.names[index], time_s, index)
 
-    def _images(self, chosen: Collection[int]) -> Iterator[tuple[int, np.ndarray | str, float]]:
-        """Index, picture, or the reason why it can't be read, and time (s) of chosen frames, in order."""
-        if self._dataset is not None:
-            yield from ((index, image, 0.0) for index, image in self._dataset.frames(chosen))
-        elif self._video is not None:
-            yield from ((index, image, time_s) for index, time_s, image in self._video.frames() if index in chosen)
-        else:
-            for index in sorted(chosen):
-                try:
-                    yield index, self._image(self._files[index]), 0.0
-                except FrameError as error:
-                    yield index, str(error), 0.0
+    def _from_files(self, chosen: Collection[int]) -> Pictures:
+        for index in sorted(chosen):
+            try:
+                yield index, self._image(self._files[index]), 0.0
+            except FrameError as error:
+                yield index, str(error), 0.0
 
     def take_reference(self, candidates: list[Path]) -> None:
         """Use the first readable picture of the frames' size as the no-contact frame."""
@@ -213,15 +206,15 @@ def _open_video(path: Path, spec: SensorSpec | None, form: Form | None) -> Recor
     video = open_video(path)
     names = [f"{path.stem}_{k:06d}" for k in range(video.count)]
     told = form_of(video.first, path.name, spec, form)
-    return Recording(path, told, names, video.first.shape[1::-1], problems=video.problems, _video=video)
+    return Recording(path, told, names, video.first.shape[1::-1], problems=video.problems, _pictures=video.frames)
 
 
 def _open_dataset(path: Path, spec: SensorSpec | None, form: Form | None, table: Path | None) -> Recording:
     if table is not None and not Path(table).is_relative_to(path):
         raise FrameError(f"{path}: a LeRobot data set holds its own labels; leave out {table}")
-    found = open_lerobot(path)
+    found = LeRobotFrames(path)
     told = form_of(found.first, path.name, spec, form)
-    recording = Recording(path, told, found.names, found.first.shape[1::-1], found.labels, problems=found.problems, _dataset=found)
+    recording = Recording(path, told, found.names, found.first.shape[1::-1], found.labels, problems=found.problems, _pictures=found.frames)
     recording.take_metadata([path / INFO.parent])
     recording.take_reference([*references_in(path), *sorted((path / RESTS).glob("*.png"))])
     return recording

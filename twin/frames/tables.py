@@ -170,12 +170,11 @@ def describe_count(things: str, names: Sequence[str] | np.ndarray) -> str:
     return f"{format_count(len(names), things)} ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})"
 
 
-@dataclass
-class Pairing:
-    """Which row of a table belongs to which picture.
+def pair_rows(names: list[str], files: list[Path]) -> tuple[dict[int, Path], list[int], list[int], list[int]]:
+    """Pair names and pictures: first by exact names, then without regard to case, then without suffix.
 
-    Attributes
-    ----------
+    Returns
+    -------
     files : dict of int to Path
         The picture of each row that has its own picture.
     loose : list of int
@@ -183,35 +182,25 @@ class Pairing:
     doubled, missing : list of int
         Rows whose picture belongs to an earlier row; rows without any picture.
     """
-
-    files: dict[int, Path]
-    loose: list[int]
-    doubled: list[int]
-    missing: list[int]
-
-
-def pair_rows(names: list[str], files: list[Path]) -> Pairing:
-    """Pair names and pictures: first by exact names, then without regard to case, then without suffix."""
-    pairing = Pairing({}, [], [], list(range(len(names))))
+    found: dict[int, Path] = {}
+    loose: list[int] = []
+    doubled: list[int] = []
+    missing = list(range(len(names)))
     for key in (str, str.casefold, bare_name):
-        taken = set(pairing.files.values())
-        free: dict[str, Path] = {}
-        for file in files:
-            if file not in taken:
-                free.setdefault(key(file.name), file)
-        missing: list[int] = []
-        for row in pairing.missing:
-            found = free.get(key(names[row]))
-            if found is None:
+        taken = set(found.values())
+        free = {key(file.name): file for file in reversed(files) if file not in taken}
+        rows, missing = missing, []
+        for row in rows:
+            file = free.get(key(names[row]))
+            if file is None:
                 missing.append(row)
-            elif found in taken:
-                pairing.doubled.append(row)
+            elif file in taken:
+                doubled.append(row)
             else:
-                pairing.files[row] = found
-                taken.add(found)
-                pairing.loose += [row] * (key is not str)
-        pairing.missing = missing
-    return pairing
+                found[row] = file
+                taken.add(file)
+                loose += [row] * (key is not str)
+    return found, loose, doubled, missing
 
 
 def order_by_table(tables: list[Path], files: list[Path], problems: list[str]) -> tuple[list[Path], dict[str, np.ndarray]]:
@@ -223,24 +212,24 @@ def order_by_table(tables: list[Path], files: list[Path], problems: list[str]) -
     pairs = [(table, names, pair_rows(names, files)) for table in readable for names in table.name_lists]
     if not pairs:
         return files, {}
-    table, names, pairing = max(pairs, key=lambda pair: len(pair[2].files))
-    if not pairing.files:
+    table, names, (found, loose, doubled, missing) = max(pairs, key=lambda pair: len(pair[2][0]))
+    if not found:
         problems.append(f"{table.name}: no row names a picture here; frames are taken in natural order")
         return files, {}
-    named = set(pairing.files.values())
+    named = set(found.values())
     unlisted = [file for file in files if file not in named]
     odd = {
-        "rows for a picture with another suffix or case": pairing.loose,
-        "rows for a picture that has one before, left out": pairing.doubled,
-        "rows without a picture": pairing.missing,
+        "rows for a picture with another suffix or case": loose,
+        "rows for a picture that has one before, left out": doubled,
+        "rows without a picture": missing,
     }
     problems += [f"{table.name}: {describe_count(what, [names[k] for k in rows])}" for what, rows in odd.items() if rows]
     if unlisted:
         what = "pictures without a row, placed after the others"
         problems.append(f"{table.name}: {describe_count(what, [p.name for p in unlisted])}")
-    rows = sorted(pairing.files)
+    rows = sorted(found)
     labels = {c: _as_array([cells[k] for k in rows] + [""] * len(unlisted)) for c, cells in table.columns.items()}
-    return [pairing.files[k] for k in rows] + unlisted, called_here(labels)
+    return [found[k] for k in rows] + unlisted, called_here(labels)
 
 
 def called_here(labels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

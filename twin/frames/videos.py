@@ -7,9 +7,10 @@ should turn the picture is stated, and not applied.
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,6 +39,8 @@ MOST_SAID = 3
 """Most reasons against frames that are stated, the most frequent ones."""
 PAUSE = 3.0
 """A pause is longer than this many times the usual time from frame to frame."""
+Pictures = Iterator[tuple[int, np.ndarray | str, float]]
+"""Index of each frame, its picture, or the reason why it can't be used, and its time, s."""
 
 
 @dataclass(frozen=True)
@@ -63,12 +66,12 @@ class Video:
     problems: list[str] = field(default_factory=list)
     faults: dict[int, str] = field(default_factory=dict)
 
-    def frames(self) -> Iterator[tuple[int, float, np.ndarray | str]]:
-        """Index, time (s) and picture of each frame, in order. A frame that can't be used gives the reason, a text, instead."""
-        for index, shown in enumerate(_read_frames(self.path)):
-            if index >= self.count:
-                return
-            yield index, shown.time_s, self.faults.get(index) or (shown.said if shown.image is None else shown.image)
+    def frames(self, chosen: Collection[int]) -> Pictures:
+        """Pictures of chosen frames, in order."""
+        last = min(self.count - 1, max(chosen, default=-1))
+        for index, shown in enumerate(islice(_read_frames(self.path), last + 1)):
+            if index in chosen:
+                yield index, self.faults.get(index) or (shown.said if shown.image is None else shown.image), shown.time_s
 
 
 def open_video(path: Path) -> Video:

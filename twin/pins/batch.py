@@ -15,8 +15,7 @@ from twin.frames import Recording, open_recording
 from twin.frames.forms import blob_spec, gray_levels
 from twin.frames.images import write_image
 from twin.frames.recording import BadFrame
-from twin.pins.labelling.reference import Reference, nominal_reference
-from twin.pins.labelling.view import view_of
+from twin.pins.labelling.reference import Reference, nominal_reference, view_of
 from twin.pins.pipeline import Pipeline, measure_reference
 from twin.progress import Step, unheard
 from twin.store import made_by, write_json, write_npz, writes

@@ -22,8 +22,7 @@ from twin.pins.detectors.detector_spec import DetectorSpec, shipped_detector, wi
 from twin.pins.detectors.tune import other_layout
 from twin.pins.finding.caps import Caps, measure_caps
 from twin.pins.labelling.identify import score_layout
-from twin.pins.labelling.reference import Reference, nominal_reference, project_rest
-from twin.pins.labelling.view import DECIDES, MOST_STRETCH, UNDECIDED, view_of
+from twin.pins.labelling.reference import DECIDES, MOST_STRETCH, UNDECIDED, Reference, nominal_reference, project_rest, view_of
 from twin.pins.pipeline import Pipeline
 from twin.progress import Step, report_each, unheard
 from twin.types import Form, Frame, Observation

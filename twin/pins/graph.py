@@ -5,9 +5,8 @@ from typing import Literal, get_args
 import numpy as np
 from scipy.spatial import cKDTree
 
-from twin.pins.flips import Net, directed_edges
 from twin.pins.labelling.reference import Reference, median_px
-from twin.pins.voronoi import triangulate, voronoi
+from twin.pins.voronoi import Net, directed_edges, triangulate, voronoi
 from twin.types import PinGraph
 
 GraphKind = Literal["knn", "delaunay", "voronoi"]

@@ -11,9 +11,10 @@ from scenes.files import require_regular
 from scenes.sensor import SensorSpec
 from twin.errors import FrameError, OptionError
 from twin.frames import open_recording
-from twin.frames.forms import frame_size, polarity_of
+from twin.frames.forms import frame_size
 from twin.pins.batch import recording_reference
-from twin.pins.detectors.legacy import LegacyPipeline
+from twin.pins.detectors.detector import Detector, make_detector
+from twin.pins.detectors.detector_spec import shipped_detector
 from twin.pins.graph import GraphKind, make_graph
 from twin.pins.labelling.reference import Reference, nominal_reference, spread_out
 from twin.pins.pipeline import Pipeline
@@ -93,7 +94,10 @@ def write_graphs_of(
     else:
         found, reference, image = _graphs_of_recording(path, sensor, kind, form, legacy=legacy)
     first = found.graphs[0]
-    pictures = draw_bare_graph(out, first) if legacy else draw_graph_pictures(out, sensor.name, first, reference, image)
+    at_rest = None
+    if kind == "voronoi" and not legacy:
+        at_rest = make_graph(kind, reference.pins_px, outmost=reference.outmost, net=reference.net)
+    pictures = draw_graph_pictures(out, sensor.name, first, at_rest, None if legacy else image)
     return replace(found, written=[write_graphs(out, found.names, found.graphs), *pictures])
 
 
@@ -111,10 +115,9 @@ def _graphs_of_recording(
     left_out: list[str] = []
     notes: list[str] = []
     reference, _ = recording_reference(spec, recording, notes)
+    pipeline: Detector | Pipeline = Pipeline(spec, recording.form, reference, graph=kind)
     if legacy:
-        pipeline: LegacyPipeline | Pipeline = LegacyPipeline(spec.pins, spec.recording, polarity=polarity_of(spec.pipeline, recording.form))
-    else:
-        pipeline = Pipeline(spec, recording.form, reference, graph=kind)
+        pipeline = make_detector(spec, shipped_detector(spec, recording.form, "legacy"))
     names: list[str] = []
     graphs: list[PinGraph] = []
     first_image: np.ndarray | None = None
@@ -216,28 +219,21 @@ def write_graphs(out: Path, names: Sequence[str], graphs: Sequence[PinGraph]) ->
     return write_npz(out / "graph.npz", arrays, compressed=True)
 
 
-def draw_graph_pictures(out: Path, title: str, graph: PinGraph, reference: Reference, image: np.ndarray) -> list[Path]:
-    """Draw ``graph.png``, and for a Voronoi graph ``surface.png``, which compares it with the reference. Returns the files.
+def draw_graph_pictures(out: Path, title: str, graph: PinGraph, at_rest: PinGraph | None, image: np.ndarray | None) -> list[Path]:
+    """Draw ``graph.png``, and ``surface.png``, which compares a Voronoi graph with one ``at_rest`` if there is one. Returns the files.
 
-    The graph is drawn over the frame (H, W[, 3]).
+    The graph is drawn over the frame (H, W[, 3]); without one, if its nodes are not in a frame's pixels, over a dark ground.
     """
     figure, (ax,) = new_figure(1, panel_inch=PICTURE_INCH)
-    draw_frame(ax, image, f"{title}: {graph.kind}, {len(graph.nodes_px)} nodes, {len(graph.edges)} directed edges")
+    size = f"{len(graph.nodes_px)} nodes, {len(graph.edges)} directed edges"
+    if image is not None:
+        draw_frame(ax, image, f"{title}: {graph.kind}, {size}")
+    else:
+        ax.set(aspect="equal", title=size, facecolor="#101418")
+        ax.invert_yaxis()
     draw_graph(ax, graph)
     draw_nodes(ax, graph)
     written = [save_figure(out / "graph.png", figure, dpi=PICTURE_DPI)]
-    if graph.kind == "voronoi":
-        rest = make_graph("voronoi", reference.pins_px, outmost=reference.outmost, net=reference.net)
-        written.append(save_figure(out / "surface.png", area_surface_figure(rest, graph), dpi=PICTURE_DPI))
+    if at_rest is not None:
+        written.append(save_figure(out / "surface.png", area_surface_figure(at_rest, graph), dpi=PICTURE_DPI))
     return written
-
-
-def draw_bare_graph(out: Path, graph: PinGraph) -> list[Path]:
-    """Draw ``graph.png`` without a frame, for nodes that are not in a frame's pixels, and return the file."""
-    figure, (ax,) = new_figure(1, panel_inch=PICTURE_INCH)
-    ax.set_facecolor("#101418")
-    draw_graph(ax, graph)
-    draw_nodes(ax, graph)
-    ax.set(aspect="equal", title=f"{len(graph.nodes_px)} nodes, {len(graph.edges)} directed edges")
-    ax.invert_yaxis()
-    return [save_figure(out / "graph.png", figure, dpi=PICTURE_DPI)]

@@ -1,7 +1,7 @@
 """The pipeline: observation of the pins in a frame, the same for rendered, recorded and live frames.
 
 The limits of an observation were chosen, not derived. A frame that is meant to show no contact is refused if its pins are displaced in a
-way that no displacement of the camera explains (`measure_reference`, `twin.pins.labelling.view`).
+way that no displacement of the camera explains (`measure_reference`, `twin.pins.labelling.reference`).
 """
 
 from copy import copy
@@ -16,14 +16,13 @@ from twin.compiled import compiled
 from twin.errors import FrameError, format_count
 from twin.frames.forms import blob_spec, form_named, frame_size, pin_levels
 from twin.pins.finding.blobs import Blobs, Mask, circular_mask, despeckle, find_blobs, find_spots, own_threshold
-from twin.pins.flips import Net
 from twin.pins.graph import GraphKind, make_graph
 from twin.pins.labelling.identify import SHOWN, score_layout
 from twin.pins.labelling.matching import Match, complete, confirm, find_again, follow, look_again, match, proven, rematch
-from twin.pins.labelling.reference import Reference, folded_fraction, make_reference, mean_radius, median_px, nominal_reference
+from twin.pins.labelling.reference import NO_CONTACT_REMEDY, Reference, camera_modes, make_reference, median_px, nominal_reference, view_of
 from twin.pins.labelling.rest import require_even
 from twin.pins.labelling.split import split_chains, split_merged
-from twin.pins.labelling.view import NO_CONTACT_REMEDY, camera_modes, view_of
+from twin.pins.voronoi import Net
 from twin.types import Form, Frame, Observation
 
 MOST_RIM_LOST = 0.75
@@ -140,20 +139,8 @@ class Pipeline:
         extra_px = np.delete(blobs.px, found.blob[paired], axis=0)
         between = self._between_caps(frame, pins_px)
         ms["complete"], now = _since(now)
-        expected, lost = int((paired | ~self._cut_off(nodes_px)).sum()), int((~paired).sum())
-        reason = self._reason(blobs, int(paired.sum()), expected, nodes_px, extra_px) or self._rim_lost(paired, nodes_px)
-        if not reason and found.lead < LEAST_LEAD * np.sqrt(len(paired)):
-            reason = (
-                "ambiguous pins: two labellings, a row apart, explain the frame nearly equally well; press or shear less, uncover "
-                "hidden pins, and cover what looks like pins beside them"
-            )
-        if not reason and (unnamed := self._count_unnamed(blobs, found, nodes_px)) >= LEAST_UNNAMED <= lost:
-            reason = (
-                f"ambiguous pins: blobs continue the rows of pins ({unnamed}), and pins are lost ({lost}): the picture is torn, or part is "
-                "labelled a row apart; take the frame again, or cover what looks like pins"
-            )
-        if not reason and between > MOST_BETWEEN:
-            reason = f"wrong pins: {between:.0%} of them stand between caps; stray light, a wrong threshold, or another sensor's frame"
+        expected = int((paired | ~self._cut_off(nodes_px)).sum())
+        reason = self._reason(blobs, found, expected, nodes_px, extra_px, between)
         graph = None
         if not reason:
             net = self._net_of(nodes_px)
@@ -309,17 +296,6 @@ class Pipeline:
             cut: np.ndarray = self._cut_off(seen.predicted_px)  # NaN where a pin was found
         return cut
 
-    def _rim_lost(self, paired: np.ndarray, nodes_px: np.ndarray) -> str:
-        """Reason why a frame with enough found pins (N,) is still not valid: too many of the rim's pins are lost. "" if it is valid."""
-        rim = self.reference.outmost[~self._cut_off(nodes_px)[self.reference.outmost]]
-        lost = int((~paired[rim]).sum())
-        if lost <= MOST_RIM_LOST * len(rim):
-            return ""
-        return (
-            f"the rim is not visible: {lost} of the {len(rim)} outermost pins are lost; fading light, too high a threshold, or a sensor "
-            "of fewer pins: run 'twin tune' on these frames, or 'twin new'"
-        )
-
     def _count_unnamed(self, blobs: Blobs, found: Match, nodes_px: np.ndarray) -> int:
         """Number of blobs of a cap's size that are no pins, but stand where the rows of pins go on, if pins are lost.
 
@@ -344,29 +320,50 @@ class Pipeline:
         near = self.reference.neighbours[:, :NEAREST]
         return share_between(self._levels(frame.image), pins_px, near, DARKER, BRIGHT)
 
-    def _reason(self, blobs: Blobs, found: int, n: int, nodes_px: np.ndarray, extra_px: np.ndarray) -> str:
-        """Reason why a frame with ``n`` pins in view is not a valid observation; "" if it is valid."""
+    def _reason(self, blobs: Blobs, labelled: Match, n: int, nodes_px: np.ndarray, extra_px: np.ndarray, between: float) -> str:
+        """Reason why a frame with ``n`` pins in view is not a valid observation; "" if it is valid.
+
+        ``between`` is the share of the pins that stand between caps.
+        """
+        paired = labelled.blob >= 0
+        found = int(paired.sum())
         if len(blobs.px) < MIN_FOUND * n / 2:
             return f"no pins: {format_count(len(blobs.px), 'blobs')} seen, {n} pins expected"
         if found < MIN_FOUND * n:
             return f"too few pins: {found} of {n} found among {len(blobs.px)} blobs, {MIN_FOUND:.0%} needed"
-        folded = folded_fraction(self.reference, nodes_px)
+        folded = self.reference.folded_fraction(nodes_px)
         if folded > MAX_FOLDED:
             return f"inconsistent pins: the labelling inverts {folded:.1%} of the layout"
         shift = np.linalg.norm(median_px(nodes_px) - self._center_px)
         if shift > MAX_SHIFT * self._radius_px:
             return f"inconsistent pins: the layout is displaced by {shift:.0f} px"
-        rim = self.reference.outmost
-        scale = mean_radius(nodes_px[rim]) / self.reference.rim_radius_px
+        scale = self.reference.rim_scale(nodes_px)
         if not 1 / MAX_RIM_SCALE < scale < MAX_RIM_SCALE:
             return f"inconsistent pins: the rim is {scale:.2f} times its size at rest; another sensor's frame, or a contact too deep"
-        if not len(extra_px):
-            return ""
         center = nodes_px.mean(axis=0)
         radius = np.linalg.norm(nodes_px - center, axis=1).max()
         extra = int((np.linalg.norm(extra_px - center, axis=1) < radius).sum())
         if extra > n or (extra > MAX_EXTRA * n and found < NEARLY_ALL * n):
             return f"too many blobs: {extra} among the {found} pins found; another sensor's frame, or clutter"
+        rim = self.reference.outmost[~self._cut_off(nodes_px)[self.reference.outmost]]
+        if (gone := int((~paired[rim]).sum())) > MOST_RIM_LOST * len(rim):
+            return (
+                f"the rim is not visible: {gone} of the {len(rim)} outermost pins are lost; fading light, too high a threshold, or a "
+                "sensor of fewer pins: run 'twin tune' on these frames, or 'twin new'"
+            )
+        if labelled.lead < LEAST_LEAD * np.sqrt(len(paired)):
+            return (
+                "ambiguous pins: two labellings, a row apart, explain the frame nearly equally well; press or shear less, uncover "
+                "hidden pins, and cover what looks like pins beside them"
+            )
+        lost = len(paired) - found
+        if (unnamed := self._count_unnamed(blobs, labelled, nodes_px)) >= LEAST_UNNAMED <= lost:
+            return (
+                f"ambiguous pins: blobs continue the rows of pins ({unnamed}), and pins are lost ({lost}): the picture is torn, or part is "
+                "labelled a row apart; take the frame again, or cover what looks like pins"
+            )
+        if between > MOST_BETWEEN:
+            return f"wrong pins: {between:.0%} of them stand between caps; stray light, a wrong threshold, or another sensor's frame"
         return ""
 
 

@@ -158,19 +158,19 @@ def read_executed(folder: Path, names: Sequence[str], problems: list[str]) -> di
 
 def _pair_shares(file: str, listed: list[str], shares: list[float], names: Sequence[str], problems: list[str]) -> dict[str, float]:
     """``shares`` by frame's name. Messages about rows that do not fit are added to ``problems``."""
-    pairing = pair_rows(listed, [Path(name) for name in names])
-    found = {picture.name: shares[row] for row, picture in pairing.files.items()}
+    pictures, loose, doubled, missing = pair_rows(listed, [Path(name) for name in names])
+    found = {picture.name: shares[row] for row, picture in pictures.items()}
     same = {bare_name(name): name for name in found}
-    contradicting = [row for row in pairing.doubled if shares[row] != found.get(same.get(bare_name(listed[row]), ""))]
+    contradicting = [row for row in doubled if shares[row] != found.get(same.get(bare_name(listed[row]), ""))]
     for row in contradicting:
         found.pop(same.get(bare_name(listed[row]), ""), None)
     unreadable = [row for row, share in enumerate(shares) if np.isnan(share)]
     odd = {
         "rows without a number from 0 to 1, true or false, or yes or no, not used": unreadable,
         "rows against an earlier row of the same frame, neither used": contradicting,
-        "rows for no frame here": pairing.missing,
-        "rows for a frame with another suffix or case": pairing.loose,
-        "rows like an earlier row": [row for row in pairing.doubled if row not in contradicting],
+        "rows for no frame here": missing,
+        "rows for a frame with another suffix or case": loose,
+        "rows like an earlier row": [row for row in doubled if row not in contradicting],
     }
     problems += [f"{file}: {describe_count(what, [listed[k] for k in rows])}" for what, rows in odd.items() if rows]
     known = {name: share for name, share in found.items() if not np.isnan(share)}

@@ -27,8 +27,7 @@ from training.errors import TrainingError
 from training.models.part import Inputs, Learnt, Modes, PinModel, Prepared, Recipe, Variant, Weights, refuse_sizes
 from training.models.vgnn.registration import Registration, count_modes, fit_registration
 from twin.pins import Reference, make_graph
-from twin.pins.flips import directed_edges
-from twin.pins.voronoi import triangulate
+from twin.pins.voronoi import directed_edges, triangulate
 
 # Features of a node: dx, dy and the logarithm of the area ratio.
 FEATURES = 3

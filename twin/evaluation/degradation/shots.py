@@ -11,7 +11,7 @@ import numpy as np
 from scenes import load_object
 from scenes.sensor import ResponseSpec, SensorSpec
 from twin.camera.capture import expose
-from twin.camera.truth import CapTruth, cap_truth
+from twin.camera.projection import CapTruth, cap_truth
 from twin.errors import ContactError, TwinError
 from twin.evaluation.degradation.condition import DegradedCase, PictureView
 from twin.evaluation.pictures.aligned import to_light

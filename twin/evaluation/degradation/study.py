@@ -22,8 +22,7 @@ from twin.evaluation.degradation.shots import RealSource
 from twin.evaluation.degradation.sweep import SEVERITIES, SweepSettings
 from twin.frames import evenly_read, open_recording
 from twin.pins import METHODS, DetectorSpec, load_detector, make_detector, shipped_detector, write_detector
-from twin.pins.detectors.detector_spec import OWN
-from twin.pins.detectors.own_finder import is_own, own_detector, own_name, own_places
+from twin.pins.detectors.detector_spec import OWN, is_own, own_detector, own_name, own_places
 from twin.pins.detectors.tune import tune
 from twin.progress import Progress, Step, report_each, silent, stage
 from twin.store import Item, inputs_digest

@@ -2,31 +2,35 @@
 
 The detectors are this program's pipeline, the published method, plain blob detectors of OpenCV and scikit-image, and functions of the
 user.
+
+The published method is that of the Tac-VGNN release (Apache-2.0), step by step. The following properties of the release are kept: frames
+are resized to a fixed size; the mask is about the image's centre; pins are found by OpenCV's SimpleBlobDetector; nodes are centred by one
+scalar median over x and y together; the hull's vertices are scaled about that origin; a frame is refused if the number of blobs is not
+exactly the sensor's; nodes have the detector's order.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
 import cv2
 import numpy as np
-from scipy.spatial import QhullError, cKDTree
+from scipy.spatial import ConvexHull, Delaunay, QhullError, Voronoi, cKDTree
 from skimage.feature import blob_dog, blob_doh, blob_log
 
 from scenes.pins import PinsSpec
 from scenes.sensor import RecordingSpec, SensorSpec
 from twin.camera.capture import record
 from twin.errors import FrameError
-from twin.frames.forms import frame_size, from_raw, pin_levels, recording_to_raw
-from twin.pins.detectors.detector_spec import OWN, DetectorSpec, with_detector
-from twin.pins.detectors.legacy import LegacyPipeline, legacy_graph
-from twin.pins.detectors.own_finder import own_places
+from twin.frames.forms import frame_size, from_raw, gray_levels, pin_levels, recording_to_raw, times
+from twin.pins.detectors.detector_spec import OWN, DetectorSpec, own_places, with_detector
 from twin.pins.finding.blobs import Mask, circular_mask, threshold
 from twin.pins.graph import make_graph
 from twin.pins.labelling.matching import match
 from twin.pins.labelling.reference import Reference, nominal_reference
 from twin.pins.pipeline import MIN_FOUND, Pipeline
+from twin.pins.voronoi import directed_edges
 from twin.types import Form, Frame, PinGraph
 
 LEVELS = 255.0
@@ -49,6 +53,8 @@ MOST_CAPS = 4
 """Largest area of a blob, in units of the largest cap's area."""
 MOST_BLOBS = 4
 """Number of blobs per pin above which a frame is refused as clutter."""
+HULL_SCALE = 1.1
+"""Factor by which the published method scales the hull's vertices about the origin."""
 
 
 @dataclass(frozen=True)
@@ -164,33 +170,147 @@ class MatchedDetector:
         return make_graph("voronoi", nodes_px, outmost=self._reference.outmost, net=self._reference.net)
 
 
+@dataclass(frozen=True)
+class LegacyParameters:
+    """The release's constants for one layout. Lengths are in px of the resized image.
+
+    Attributes
+    ----------
+    size_px : int
+        Side of the square that a frame is resized to.
+    threshold : int
+        Threshold of the detector, gray levels.
+    mask_offset_px : (int, int)
+        Offset of the mask's centre from the image's centre, x and y.
+    mask_margin_px : int
+        Distance between the mask and the image's border.
+    min_area_px2 : float
+    virtual_rotations_deg, virtual_scales : tuple of float
+        Turns and scales of the copies of the hull that fill the concave sides of a hexagon.
+    """
+
+    size_px: int
+    threshold: int
+    mask_offset_px: tuple[int, int]
+    mask_margin_px: int
+    min_area_px2: float
+    virtual_rotations_deg: tuple[float, ...] = ()
+    virtual_scales: tuple[float, ...] = ()
+
+
+LEGACY: dict[str, LegacyParameters] = {
+    "rings": LegacyParameters(300, 100, (-1, -2), 14, 10.0),
+    "hexagon": LegacyParameters(
+        256, 80, (0, 2), 15, 1.0, (7.0, 12.0, 22.0, 30.0, 38.0, 48.0, 53.0), (0.95, 0.9, 0.85, 0.85, 0.85, 0.9, 0.95)
+    ),
+}
+
+
+def legacy_parameters(layout: str) -> LegacyParameters:
+    """The release's constants for a layout.
+
+    Raises
+    ------
+    FrameError
+        The release has none for it.
+    """
+    if layout not in LEGACY:
+        raise FrameError(f"the published method knows only layouts of rings and hexagons, not '{layout}'; use another `method`")
+    return LEGACY[layout]
+
+
+def legacy_detector(parameters: LegacyParameters) -> cv2.SimpleBlobDetector:
+    """The release's blob detector."""
+    settings = cv2.SimpleBlobDetector.Params()
+    settings.blobColor = 255
+    settings.minThreshold, settings.maxThreshold, settings.thresholdStep = 50, 220, 5
+    settings.minDistBetweenBlobs, settings.minRepeatability = 3, 3
+    settings.filterByArea, settings.minArea, settings.maxArea = True, parameters.min_area_px2, 5000
+    settings.filterByCircularity, settings.minCircularity = True, 0.01
+    settings.filterByConvexity, settings.minConvexity = True, 0.01
+    settings.filterByInertia, settings.minInertiaRatio = True, 0.01
+    return cv2.SimpleBlobDetector.create(settings)
+
+
+def boundary_nodes(nodes: np.ndarray, parameters: LegacyParameters) -> np.ndarray:
+    """The enlarged vertices of the hull. For a hexagon also turned and scaled copies of them, which fill its concave sides."""
+    bound = HULL_SCALE * nodes[ConvexHull(nodes).vertices]
+    nodes_around = [bound]
+    for degrees, scale in zip(parameters.virtual_rotations_deg, parameters.virtual_scales, strict=True):
+        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+        nodes_around.append(scale * bound @ [[c, s], [-s, c]])
+    return np.concatenate(nodes_around)
+
+
+def legacy_graph(nodes: np.ndarray, parameters: LegacyParameters) -> PinGraph:
+    """Delaunay edges and Voronoi areas of centred nodes (N, 2), as published (Algorithm 1 of the paper).
+
+    The edges of a convex layout are those of its triangulation. For a hexagon, nodes and boundary nodes are triangulated together, and the
+    edges between nodes are used.
+    """
+    n = len(nodes)
+    extended = np.concatenate([nodes, boundary_nodes(nodes, parameters)])
+    triangulated = extended if parameters.virtual_scales else nodes
+    edges = directed_edges(Delaunay(triangulated).simplices, len(triangulated))
+    edges = edges[(edges < n).all(axis=1)]
+    diagram = Voronoi(extended)
+    area, cells = np.full(n, np.nan), []
+    for i in range(n):
+        region, cell = diagram.regions[diagram.point_region[i]], np.empty((0, 2))
+        if region and -1 not in region:
+            cell = diagram.vertices[region]
+            cell = cell[ConvexHull(cell).vertices]
+            area[i] = ConvexHull(cell).volume
+        cells.append(cell)
+    return PinGraph("voronoi", nodes, edges, area, cells)
+
+
 class LegacyDetector:
-    """The published method. Raw frames are first converted by the published recorder."""
+    """The published method. Raw frames are first converted by the published recorder.
+
+    The pins' layout decides which of the release's constants are used, and their count is the only accepted number of blobs. Graphs are in
+    the release's unit: px of the resized image, centred by the scalar median.
+    """
 
     def __init__(self, pins: PinsSpec, recording: RecordingSpec | None, spec: DetectorSpec) -> None:
         recording = spec.recording or recording
+        if spec.blob.polarity == "dark":
+            raise FrameError("the published method finds bright pins only, and the sensor's are dark (polarity); use another method")
         if recording is None:
             raise FrameError(
-                f"'{spec.name}': the published method needs a recorder's crop and threshold, the sensor has none;"
+                f"'{spec.name}': the published method needs a recorder's crop and threshold ([recording]), the sensor has none;"
                 " run 'twin tune --method legacy'"
             )
-        self.spec, self._recording = spec, recording
-        self._pipeline = LegacyPipeline(pins, recording, polarity=spec.blob.polarity)
+        self.spec, self._recording, self._count, self._parameters = spec, recording, pins.count, legacy_parameters(pins.layout)
+        self._size_px = recording.width_px, recording.height_px
+        self._detector = legacy_detector(self._parameters)
+        size, (right, down) = self._parameters.size_px, self._parameters.mask_offset_px
+        radius = size // 2 - self._parameters.mask_margin_px
+        self._mask = cv2.circle(np.zeros((size, size), np.uint8), (size // 2 + right, size // 2 + down), radius, 255, -1)
 
     def __call__(self, frame: Frame) -> Found:
-        raw = frame.form == Form.RAW
-        if raw:
-            frame = Frame(record(frame.image, self._recording), Form.PROCESSED, frame.name)
-        seen = self._pipeline(frame)
-        px = recording_to_raw(self._recording, seen.nodes_px) if raw else seen.nodes_px
-        return Found(px, None, seen.graph, self._pipeline.count, seen.valid, seen.reason)
+        if frame.form == Form.RAW:
+            seen = self(Frame(record(frame.image, self._recording), Form.PROCESSED, frame.name))
+            return replace(seen, claims_px=recording_to_raw(self._recording, seen.claims_px))
+        if frame.image.shape[1::-1] != self._size_px:
+            raise FrameError(f"{frame.name or 'frame'}: the published method takes recordings of {times(self._size_px)} only")
+        n, size = self._count, self._parameters.size_px
+        _, binary = cv2.threshold(cv2.resize(gray_levels(frame.image), (size, size)), self._parameters.threshold, 255, cv2.THRESH_BINARY)
+        nodes = np.array([point.pt for point in self._detector.detect(cv2.bitwise_and(binary, self._mask))], float).reshape(-1, 2)
+        nodes_px = (nodes + 0.5) * (np.array(self._size_px) / size) - 0.5
+        if len(nodes) != n:
+            return Found(nodes_px, None, None, n, False, f"{len(nodes)} blobs found, exactly {n} expected")
+        graph = self._graph(nodes)
+        return Found(nodes_px, None, graph, n, graph is not None, "" if graph else "the blobs have no tessellation")
 
     def graph_of(self, nodes_px: np.ndarray) -> PinGraph | None:
-        size = self._pipeline.parameters.size_px
         recorded = from_raw(self._recording, Form.PROCESSED, nodes_px) if self.spec.form == Form.RAW else nodes_px
-        nodes = (recorded + 0.5) * size / np.array(self._pipeline.size_px) - 0.5
+        return self._graph((recorded + 0.5) * self._parameters.size_px / np.array(self._size_px) - 0.5)
+
+    def _graph(self, nodes: np.ndarray) -> PinGraph | None:
+        """The graph of nodes (N, 2), px of the resized image; None if they have no tessellation."""
         try:
-            return legacy_graph(nodes - np.median(nodes), self._pipeline.parameters)
+            return legacy_graph(nodes - np.median(nodes), self._parameters)
         except QhullError:
             return None
 

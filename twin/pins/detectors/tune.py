@@ -12,23 +12,11 @@ from twin.errors import FrameError, format_count
 from twin.frames import spread_indices
 from twin.frames.forms import pin_levels, polarity_of
 from twin.geometry.pins import pin_lattice
-from twin.pins.detectors.detector import Found, make_detector
+from twin.pins.detectors.detector import Found, legacy_parameters, make_detector
 from twin.pins.detectors.detector_spec import DetectorSpec, Evidence, Method, with_detector
-from twin.pins.detectors.legacy import legacy_parameters
-from twin.pins.labelling.identify import (
-    SAME_SHAPE,
-    SHOWN,
-    SURE_EXPLAINED,
-    Candidate,
-    Identified,
-    identify,
-    score_layout,
-    smooth_view,
-    symmetries,
-)
-from twin.pins.labelling.reference import Reference, make_reference, nominal_reference, together
+from twin.pins.labelling.identify import SAME_SHAPE, SHOWN, SURE_EXPLAINED, Candidate, Identified, identify, score_layout, symmetries
+from twin.pins.labelling.reference import Reference, camera_modes, make_reference, nominal_reference, smooth_view, together, view_of
 from twin.pins.labelling.rest import Rest, rest_of
-from twin.pins.labelling.view import camera_modes, view_of
 from twin.progress import Step, report_each, unheard
 from twin.types import Form, Frame
 
@@ -137,8 +125,6 @@ def tune(
         )
     if known is None:
         doubts = other_layout(layout, images)
-    shape = frames[0].image.shape
-    size_px = (shape[1], shape[0])
     if rest is None:
         given_levels = None if given is None else pin_levels(given.image, polarity)
         rest = rest_of(layout, [f.name for f in frames], given_levels, given.name if given else "")
@@ -149,7 +135,7 @@ def tune(
     reference = make_reference(turned_as(sensor.pins, layout.rest_px), sensor.pins)
     caps = [caps_in(image, seen.pins_px, reference.spacing_px) for image, seen in zip(images, layout.seen, strict=True)]
     area, contrast = (float(np.nanmedian(values)) for values in zip(*caps, strict=True))
-    start = _start(size_px, reference, layout, area, method, form, sensor.pins.layout, polarity)
+    start = _start(frames[0], reference, layout, area, method, polarity)
     sensor = with_detector(sensor, start)
     tried, judged = list(_settings(start, reference, contrast, form == Form.PROCESSED)), frames
     if method in SLOW:
@@ -244,16 +230,7 @@ def caps_in(gray: np.ndarray, pins_px: np.ndarray, spacing_px: np.ndarray) -> tu
     return (float(np.median(areas)), float(np.median(contrasts))) if areas else (np.nan, np.nan)
 
 
-def _start(
-    size_px: tuple[int, int],
-    reference: Reference,
-    layout: Candidate,
-    area: float,
-    method: Method,
-    form: Form,
-    kind: str,
-    polarity: Polarity,
-) -> DetectorSpec:
+def _start(frame: Frame, reference: Reference, layout: Candidate, area: float, method: Method, polarity: Polarity) -> DetectorSpec:
     """A detector with the mask and the caps' size, before a threshold is chosen."""
     rim = reference.pins_px[reference.outmost]
     center = (rim.max(axis=0) + rim.min(axis=0)) / 2
@@ -267,14 +244,16 @@ def _start(
         mask_radius_px=round(float(radius), 1),
         min_area_px2=round(max(LEAST_AREA * area, 1.0), 1),
     )
+    height, width = frame.image.shape[:2]
+    recorded = method == "legacy" and frame.form == Form.RAW
     return DetectorSpec(
         name=method,
         method=method,
-        form=form,
-        size_px=size_px,
+        form=frame.form,
+        size_px=(width, height),
         blob=blob,
         radius_px=(smallest, largest),
-        recording=_recorder(size_px, blob, kind) if method == "legacy" and form == Form.RAW else None,
+        recording=_recorder((width, height), blob, layout.pins.layout) if recorded else None,
         pins_px=tuple(map(tuple, reference.pins_px.round(2).tolist())),
     )
 
@@ -347,13 +326,10 @@ def _plateau(tried: list[DetectorSpec], rates: list[Rate], k: int) -> list[int]:
     series = [j for j, detector in enumerate(tried) if _series_of(detector) == _series_of(tried[k])]
     series.sort(key=lambda j: _threshold(tried[j]))
     at = series.index(k)
-    low = high = at
-    good = [sum(rates[j]) >= sum(rates[k]) - NEAR for j in series]
-    while low > 0 and good[low - 1]:
-        low -= 1
-    while high < len(series) - 1 and good[high + 1]:
-        high += 1
-    return series[low : high + 1]
+    worse = [place for place, j in enumerate(series) if sum(rates[j]) < sum(rates[k]) - NEAR]
+    low = max((place + 1 for place in worse if place < at), default=0)
+    high = min((place for place in worse if place > at), default=len(series))
+    return series[low:high]
 
 
 def _middle_of_plateau(tried: list[DetectorSpec], rates: list[Rate]) -> int:

@@ -17,8 +17,7 @@ from scenes.layouts.base import LatticeLayout
 from scenes.pins import PinsSpec
 from twin.geometry.pins import usual_spacing
 from twin.pins.finding.bumps import Bumps
-from twin.pins.labelling.families import family
-from twin.pins.labelling.growth import locate_places
+from twin.pins.labelling.families import family, locate_places
 
 FLAT_SIDE_PX = 5
 """Side of a square around a pixel, px. If all its gray levels are equal, the frame is filled or masked there: camera noise would differ."""

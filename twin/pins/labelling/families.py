@@ -1,4 +1,9 @@
-"""Families of pin layouts, and the labelling of a frame's spots by them. A family is a large lattice that contains a sensor's layout."""
+"""Families of pin layouts, and the labelling of a frame's spots by them. A family is a large lattice that contains a sensor's layout.
+
+A labelling grows from a few labels outwards, for any scale, turn and distortion of the view. A local affine map, fitted to the labelled
+places around the next place, predicts the position of this place in the frame. Therefore the lattice may be foreshortened or slowly curved;
+only its topology must be known. All distances are relative to the local spacing. All limits were chosen, not derived.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,7 +16,6 @@ from scenes.layouts.base import LatticeLayout
 from scenes.pins import PinsSpec
 from twin.geometry.pins import pin_lattice, usual_spacing
 from twin.pins.finding.bumps import Bumps
-from twin.pins.labelling.growth import NEIGHBOURS, grow
 
 NEARLY_ALL = 0.95
 """Share of the spots that a labelling must hold to end the search for a better start."""
@@ -27,6 +31,20 @@ LAID_GATE = 0.3
 """Largest distance of a spot from a place of the layout laid over it, in spacings, at which the spot gets a first label."""
 KEPT = 512
 """Number of labellings that are kept."""
+NEIGHBOURS = 18
+"""Number of neighbours that predict the position of a place: two rings of a triangular lattice."""
+NEAR = 8
+"""A place is tried when at least two of this many nearest places are labelled."""
+GATES = (0.25, 0.38)
+"""Largest distance from a prediction to its spot, in local spacings, during growth: first the strict limit, then the wide one."""
+LEAST_AROUND = (4, 3)
+"""Least number of labelled neighbours for a prediction, with each limit of ``GATES``."""
+FINAL_GATE = 0.42
+"""Largest distance of a spot from the prediction by all its labelled neighbours, in local spacings. A label beyond it is removed."""
+MOST_STRETCH = 3.0
+"""Largest ratio of the local map's scales in two directions. Around a cap at the rim of a dome the ratio is 2."""
+ROUNDS = 3
+"""Number of rounds. Each round grows the labelling and then removes the labels that contradict their neighbours; the last only grows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +100,8 @@ def _label_places(spots: bytes, by: Family) -> np.ndarray | None:
     """The labelling (M,) of spots (K, 2), float64. It is kept, because the same frames are compared with several layouts."""
     px = np.frombuffer(spots).reshape(-1, 2).copy()
     best, most = None, LEAST_GROWN - 1
-    for start, cell in _starts(px, by, by.kind) if by.kind else _lay_lattice(px, by):
-        labels = grow(by.lattice, by.around, px, start, cell)
+    for start in _starts(px, by, by.kind) if by.kind else _lay_lattice(px, by):
+        labels = grow(by.lattice, by.around, px, start)
         count = int((labels >= 0).sum())
         if count > most:
             best, most = labels, count
@@ -92,8 +110,8 @@ def _label_places(spots: bytes, by: Family) -> np.ndarray | None:
     return best
 
 
-def _starts(px: np.ndarray, by: Family, kind: type[LatticeLayout]) -> Iterator[tuple[np.ndarray, float]]:
-    """First labels (M,) and the spots' distance, px: a spot and its nearest spots, beginning with the one nearest to the x direction."""
+def _starts(px: np.ndarray, by: Family, kind: type[LatticeLayout]) -> Iterator[np.ndarray]:
+    """First labels (M,): a spot and its nearest spots, beginning with the one nearest to the x direction."""
     (least, most), (middle, places) = kind.gaps_deg, kind.start()
     distance, near = cKDTree(px).query(px, k=kind.corners + 1)
     away = np.linalg.norm(px - np.median(px, axis=0), axis=1)
@@ -110,11 +128,11 @@ def _starts(px: np.ndarray, by: Family, kind: type[LatticeLayout]) -> Iterator[t
         start = np.full(len(by.lattice), -1)
         start[middle] = spot
         start[places] = np.roll(ring[order], -first)
-        yield start, float(np.median(reach))
+        yield start
 
 
-def _lay_lattice(px: np.ndarray, by: Family) -> Iterator[tuple[np.ndarray, float]]:
-    """First labels (M,) and the spacing, px: the lattice, laid over the spots by middle, size and turn, labels spots nearby."""
+def _lay_lattice(px: np.ndarray, by: Family) -> Iterator[np.ndarray]:
+    """First labels (M,): the lattice, laid over the spots by middle, size and turn, labels spots nearby."""
     tree = cKDTree(px)
     low, high = np.percentile(px, [2, 98], axis=0)
     inside = px[((px >= low) & (px <= high)).all(axis=1)]
@@ -122,19 +140,97 @@ def _lay_lattice(px: np.ndarray, by: Family) -> Iterator[tuple[np.ndarray, float
     lattice = by.lattice - by.lattice.mean(axis=0)
     lattice = lattice / np.sqrt(np.mean(np.sum(lattice**2, axis=1)))
     spacing = usual_spacing(lattice)
-    laid: list[tuple[int, np.ndarray, float]] = []
+    laid: list[np.ndarray] = []
     for scale in LAID_SCALES:
         for turn in np.exp(1j * np.radians(TURNS_DEG)):
             at = middle + scale * size * (lattice @ np.array([[turn.real, turn.imag], [-turn.imag, turn.real]]))
-            reach = spacing * scale * size
             distance, spot = tree.query(at)
-            start = np.where(distance < LAID_GATE * reach, spot, -1)
-            _, first = np.unique(start, return_index=True)
-            once = np.zeros(len(start), bool)
-            once[first] = True
-            start = np.where(once, start, -1)
-            laid.append((int((start >= 0).sum()), start, reach))
-    laid.sort(key=lambda entry: -entry[0])
-    for count, start, reach in laid[:5]:
-        if count >= LEAST_GROWN:
-            yield start, reach
+            start = np.where(distance < LAID_GATE * spacing * scale * size, spot, -1)
+            again = np.ones(len(start), bool)
+            again[np.unique(start, return_index=True)[1]] = False
+            laid.append(np.where(again, -1, start))
+    laid.sort(key=lambda start: -int((start >= 0).sum()))
+    yield from (start for start in laid[:5] if (start >= 0).sum() >= LEAST_GROWN)
+
+
+def predict_places(
+    which: np.ndarray, lattice: np.ndarray, around: np.ndarray, spot: np.ndarray, px: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (n, 2) of places ``which`` (n,) as their labelled neighbours predict them, and local spacings (n,), px.
+
+    The prediction is a weighted affine map. It is NaN if the map is not determined, mirrors the lattice, or stretches it too much.
+    """
+    near, labels = around[which], spot[around[which]]
+    away = lattice[near] - lattice[which, None]
+    terms = np.concatenate([np.ones((*near.shape, 1)), away], axis=2)
+    weighted = (terms * ((labels >= 0) / (0.5 + (away**2).sum(axis=2)))[..., None]).transpose(0, 2, 1)
+    normal = weighted @ terms
+    known = ((labels >= 0).sum(axis=1) >= 3) & (np.abs(np.linalg.det(normal)) >= 1e-6 * normal[:, 0, 0] ** 3)
+    normal[~known] = np.eye(3)
+    fit = np.linalg.solve(normal, weighted @ px[labels])
+    half, area = (fit[:, 1:] ** 2).sum(axis=(1, 2)) / 2, fit[:, 1, 0] * fit[:, 2, 1] - fit[:, 2, 0] * fit[:, 1, 1]
+    root = np.sqrt(np.maximum(half**2 - area**2, 0))  # squares of the map's scales are half -+ root
+    known &= (area > 0) & (half + root <= MOST_STRETCH**2 * (half - root))
+    return np.where(known[:, None], fit[:, 0], np.nan), np.where(known, np.sqrt(np.maximum(half - root, 0)), np.nan)
+
+
+def grow(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Grow a labelling: the spot (M,) of each place of a lattice, -1 for no spot.
+
+    Parameters
+    ----------
+    lattice : (M, 2) float
+        Positions of the places. Neighbouring places are about 1 apart.
+    around : (M, k) int
+        Neighbours of each place, the nearest first.
+    px : (K, 2) float
+        The spots.
+    start : (M,) int
+        First labels, at least three, not on a line.
+    """
+    spot = start.copy()
+    for _ in range(ROUNDS - 1):
+        _extend(lattice, around, px, spot)
+        held = np.flatnonzero(spot >= 0)
+        at, spacing = predict_places(held, lattice, around, spot, px)
+        right = np.linalg.norm(px[spot[held]] - at, axis=1) <= FINAL_GATE * spacing
+        if right.all():
+            return spot
+        spot[held[~right]] = -1
+    _extend(lattice, around, px, spot)
+    return spot
+
+
+def _extend(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, spot: np.ndarray) -> None:
+    """Add labels to a labelling ``spot`` (M,), from the labelled places outwards. Of the places that claim a spot the nearest gets it."""
+    for gate, least in zip(GATES, LEAST_AROUND, strict=True):
+        tried = np.zeros(len(lattice), int)
+        while True:
+            held = spot >= 0
+            place = np.flatnonzero(~held & (held[around[:, :NEAR]].sum(axis=1) >= 2))
+            count = held[around[place]].sum(axis=1)
+            place = place[(count >= least) & (count != tried[place])]
+            tried[place] = held[around[place]].sum(axis=1)
+            at, spacing = predict_places(place, lattice, around, spot, px)
+            known, free = np.isfinite(spacing), np.flatnonzero(np.bincount(spot[held], minlength=len(px)) == 0)
+            if not known.any() or not len(free):
+                break
+            distance, nearest = cKDTree(px[free]).query(at[known])
+            miss = distance / spacing[known]
+            order = np.argsort(-miss)
+            order = order[miss[order] < gate]
+            if not len(order):
+                break
+            claim = np.full(len(px), -1)
+            claim[free[nearest[order]]] = place[known][order]  # of several claims the last one stays, which is the nearest
+            spot[claim[claim >= 0]] = np.flatnonzero(claim >= 0)
+
+
+def locate_places(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, spot: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+    """Positions (M, 2), px, of a lattice's places: of the spots, or predicted from labelled neighbours; NaN without a prediction.
+
+    A predicted position may lie outside the frame. It then shows that the frame cuts a pin off.
+    """
+    out, _ = predict_places(np.arange(len(lattice)), lattice, around, spot, px)
+    out[~((out > -np.array(size_px)) & (out < 2 * np.array(size_px))).all(axis=1)] = np.nan
+    return np.where((spot >= 0)[:, None], px[spot], out)

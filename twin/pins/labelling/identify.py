@@ -26,10 +26,9 @@ from twin.frames.forms import is_two_level, levels_at, pin_levels
 from twin.geometry.pins import namings, pin_lattice, usual_spacing
 from twin.pins.finding.bumps import Bumps, recent_bumps
 from twin.pins.labelling.extent import filled_area, find_beyond, in_view, open_sides, with_view
-from twin.pins.labelling.families import Family, families, family, family_of_positions, label_spots
-from twin.pins.labelling.growth import locate_places
+from twin.pins.labelling.families import Family, families, family, family_of_positions, label_spots, locate_places
 from twin.pins.labelling.matching import match
-from twin.pins.labelling.reference import make_reference, spread_out, together
+from twin.pins.labelling.reference import make_reference, smooth_view, spread_out, together, view_terms
 from twin.progress import Step, unheard
 
 SIZES = tuple(0.003 * 1.4**k for k in range(8))
@@ -523,7 +522,7 @@ def _at_likelier_spots(pins: PinsSpec, rest_px: np.ndarray, seen: Sequence[Layou
     """
     if len(rest_px) < 2 * FEWEST_VIEWED or unevenness(pin_lattice(pins).places, rest_px) > SMOOTH:
         return rest_px
-    terms = _view_terms(pin_lattice(pins).places)
+    terms = view_terms(pin_lattice(pins).places)
     solve = np.linalg.pinv(terms)
     leverage = np.minimum(np.einsum("nt,tn->n", terms, solve), 1 - 1e-6)
     without_it = rest_px - (rest_px - terms @ (solve @ rest_px)) / (1 - leverage)[:, None]  # the view of all other pins, by least squares
@@ -589,31 +588,6 @@ def order_like(orders: list[np.ndarray], pins_px: np.ndarray, like_px: np.ndarra
     """The one of some orders (N,) of pins (N, 2), NaN where unknown, in which they are nearest to ``like_px`` (N, 2), by the median."""
     away = [np.linalg.norm(pins_px[order] - like_px, axis=1) for order in orders]
     return orders[int(np.argmin([np.nanmedian(each) if np.isfinite(each).any() else np.inf for each in away]))]
-
-
-def smooth_view(places: np.ndarray, px: np.ndarray) -> np.ndarray:
-    """Fit a smooth view of a layout to its pins, and return the positions (N, 2), px, of all pins in this view.
-
-    The view is a polynomial of the third degree with radial terms of the fifth degree. It can represent the camera's position, turn, tilt
-    and distortion, and the projection of the dome.
-
-    Parameters
-    ----------
-    places : (N, 2) float
-        Places of the layout.
-    px : (N, 2) float
-        Pins, px; NaN where unknown.
-    """
-    known, terms = np.isfinite(px[:, 0]), _view_terms(places)
-    solved = np.linalg.lstsq(terms[known], px[known], rcond=None)[0]
-    return terms @ solved
-
-
-def _view_terms(places: np.ndarray) -> np.ndarray:
-    """The terms (N, 10) of a smooth view at places (N, 2)."""
-    x, y = places.T
-    r2 = x * x + y * y
-    return np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y, x * r2, y * r2, x * r2 * r2, y * r2 * r2])
 
 
 def unevenness(places: np.ndarray, pins_px: np.ndarray) -> float:

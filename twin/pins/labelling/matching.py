@@ -27,7 +27,6 @@ from scipy.spatial import cKDTree
 
 from twin.compiled import compiled
 from twin.geometry.drift import drift
-from twin.pins.labelling.buckets import Buckets, blobs_near, fill_buckets, nearest_free
 from twin.pins.labelling.reference import Reference, count_turned_over, median_px
 
 RIDGE = 0.25
@@ -107,6 +106,8 @@ MOST_LEFT = 0.03
 MOST_MISFIT = 0.15
 """Largest rms distance, in spacings, from the places of the coherent motion to the blobs. Deep contacts of two recordings have
 at most 0.13, a torn picture 0.18."""
+Buckets = tuple[np.ndarray, np.ndarray, float, float, int, int]
+"""First blob of each cell, next blob in the same cell, x0, y0, columns, rows."""
 
 
 class LayoutArrays(NamedTuple):
@@ -487,23 +488,12 @@ def predict_all(layout: LayoutArrays, moved: np.ndarray, weight: np.ndarray) -> 
 
 
 @compiled()
-def _pairs(px: np.ndarray, blob: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (N, 2) of the pairs of a labelling (N,), and their weights (N,): 1, and 0 for a pin without a blob."""
-    moved, weight = np.zeros((len(blob), 2)), np.zeros(len(blob))
-    for i in range(len(blob)):
-        if blob[i] >= 0:
-            moved[i, 0], moved[i, 1] = px[blob[i], 0], px[blob[i], 1]
-            weight[i] = 1.0
-    return moved, weight
-
-
-@compiled()
 def _grow(layout: LayoutArrays, blobs: FrameBlobs, start: np.ndarray) -> np.ndarray:
     """Grow a labelling (N,) from ``start`` (N,), which has at least one pair. Each round labels pins next to labelled ones."""
     rest, neighbours, spacing, px = layout.rest, layout.neighbours, layout.spacing, blobs.px
     n = len(rest)
     blob = start.copy()
-    moved, weight = _pairs(px, blob)
+    moved, weight = px[blob], (blob >= 0).astype(np.float64)
     taken = np.zeros(len(px), np.bool_)
     near = min(6, neighbours.shape[1])
     labelled = 0
@@ -604,18 +594,11 @@ def _unwound(layout: LayoutArrays, px: np.ndarray, blob: np.ndarray) -> np.ndarr
     return out
 
 
-@compiled()
 def _trust(layout: LayoutArrays, px: np.ndarray, blob: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Positions (N, 2) of the pairs, and their weights (N,), which decrease with the distance from the place predicted by neighbours."""
-    moved, weight = _pairs(px, blob)
-    predicted = predict_all(layout, moved, weight)
-    for i in range(len(blob)):
-        if weight[i] > 0:
-            r2 = (predicted[i, 0] - moved[i, 0]) ** 2 + (predicted[i, 1] - moved[i, 1]) ** 2
-            weight[i] = 1.0 / (1.0 + r2 / (SOFT_RESIDUAL * layout.spacing[i]) ** 2)
-            if not np.isfinite(weight[i]):
-                weight[i] = 0.0
-    return moved, weight
+    moved, weight = px[blob], (blob >= 0).astype(float)
+    away2 = ((predict_all(layout, moved, weight) - moved) ** 2).sum(axis=1)
+    return moved, np.fmax(weight / (1 + away2 / (SOFT_RESIDUAL * layout.spacing) ** 2), 0.0)  # 0 without a prediction
 
 
 @compiled()
@@ -734,3 +717,42 @@ def _layout(reference: Reference) -> LayoutArrays:
 def _put_in_cells(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> FrameBlobs:
     px, cell = np.ascontiguousarray(px), reference.pitch_px
     return FrameBlobs(px, area_px2, fill_buckets(px, cell), cell)
+
+
+@compiled()
+def fill_buckets(px: np.ndarray, cell: float) -> Buckets:
+    """Put blobs (K, 2) into square cells with the side ``cell``, px."""
+    x0, y0 = px[:, 0].min(), px[:, 1].min()
+    columns = int((px[:, 0].max() - x0) / cell) + 1
+    rows = int((px[:, 1].max() - y0) / cell) + 1
+    head = np.full(columns * rows, -1)
+    following = np.full(len(px), -1)
+    for k in range(len(px)):
+        c = int((px[k, 1] - y0) / cell) * columns + int((px[k, 0] - x0) / cell)
+        following[k] = head[c]
+        head[c] = k
+    return head, following, x0, y0, columns, rows
+
+
+@compiled()
+def blobs_near(x: float, y: float, reach: float, px: np.ndarray, buckets: Buckets, cell: float) -> Iterator[tuple[int, float]]:
+    """Blobs within ``reach`` of (x, y): index and squared distance of each."""
+    head, following, x0, y0, columns, rows = buckets
+    for cy in range(max(int((y - reach - y0) / cell), 0), min(int((y + reach - y0) / cell), rows - 1) + 1):
+        for cx in range(max(int((x - reach - x0) / cell), 0), min(int((x + reach - x0) / cell), columns - 1) + 1):
+            k = head[cy * columns + cx]
+            while k >= 0:
+                d2 = (px[k, 0] - x) ** 2 + (px[k, 1] - y) ** 2
+                if d2 < reach * reach:
+                    yield k, d2
+                k = following[k]
+
+
+@compiled()
+def nearest_free(x: float, y: float, reach: float, px: np.ndarray, taken: np.ndarray, buckets: Buckets, cell: float) -> tuple[int, float]:
+    """Nearest free blob within ``reach`` of (x, y): (index or -1, squared distance)."""
+    best, best_d2 = -1, reach * reach
+    for k, d2 in blobs_near(x, y, reach, px, buckets, cell):
+        if d2 < best_d2 and not taken[k]:
+            best, best_d2 = k, d2
+    return best, best_d2

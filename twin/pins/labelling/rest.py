@@ -9,8 +9,7 @@ from scenes.pins import PinsSpec
 from twin.errors import FrameError
 from twin.geometry.pins import pin_lattice
 from twin.pins.labelling.identify import SHOWN, Candidate, order_like, score_layout, symmetries, unevenness
-from twin.pins.labelling.reference import mean_radius
-from twin.pins.labelling.view import MOST_UNEVEN, uneven_dent
+from twin.pins.labelling.reference import MOST_UNEVEN, mean_radius, uneven_dent
 
 STILL = 0.035
 """Largest rms distance of pins without contact from the smooth view of their layout, in spacings. It was measured as 0.028 in no-contact

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from functools import cache
+from inspect import isgeneratorfunction
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,9 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def decorate(function: Callable[..., Any]) -> Any:
         try:
-            dispatcher = numba.njit(cache=True, no_cfunc_wrapper=True, **options)(function)  # Python alone calls it
+            # of a generator that was stored by another process, Numba can't compile a caller; code in C calls none
+            chosen: dict[str, Any] = {"cache": not isgeneratorfunction(function), "no_cfunc_wrapper": True} | options
+            dispatcher = numba.njit(**chosen)(function)
         except RuntimeError as error:
             if "cannot cache function" not in str(error):
                 raise

@@ -36,6 +36,31 @@ def test_machine_code_is_kept(functions, tmp_path):
     assert list((tmp_path / "kept").rglob("*.nbc"))
 
 
+GENERATOR = """
+import sys
+from twin.compiled import compiled
+@compiled()
+def below(n):
+    for k in range(n):
+        yield k
+@compiled()
+def total(n):
+    found = 0
+    for k in below(n):
+        found += k
+    return found
+print(sum(below(4)) if "generator" in sys.argv else total(4))
+"""
+
+
+def test_a_generator_that_another_process_compiled_can_be_called_by_compiled_code(tmp_path):
+    (tmp_path / "generator.py").write_text(GENERATOR)
+    for what in ("generator", "caller", "caller"):
+        command = [sys.executable, "generator.py", what]
+        env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kept"), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        assert subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, check=True).stdout == "6\n"
+
+
 def test_where_no_folder_can_be_written_it_is_compiled_all_the_same(functions, tmp_path, monkeypatch):
     monkeypatch.setattr(numba.config, "CACHE_LOCATOR_CLASSES", "ZipCacheLocator")  # of numba's places one that is none here
     with pytest.warns(RuntimeWarning, match="can't be kept .*no folder.*NUMBA_CACHE_DIR") as told:

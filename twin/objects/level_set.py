@@ -74,4 +74,4 @@ def unit_normals(slope: FloatArray, hessian: FloatArray) -> None:
         for i in range(3):
             slope[k, i] = n[i]
             for j in range(3):
-                h[i, j] = (h[i, j] - (bent[i] * n[j] + bent[j] * n[i]) + along * n[i] * n[j]) / size
+                h[i, j] = (h[i, j] - (bent[i] * n[j] + bent[j] * n[i]) + along * (n[i] * n[j])) / size

@@ -107,7 +107,7 @@ class Collection:
         self.pictures.mkdir(exist_ok=True)
         for lines in (table, self.folder / LOG):
             if lines.is_file():
-                with _damaged(lines):
+                with _on_damage(lines):
                     text = lines.read_text(encoding="utf-8")
                 if not text.endswith("\n"):  # the last line is torn
                     write_text(lines, text[: text.rfind("\n") + 1])
@@ -124,7 +124,7 @@ class Collection:
             The table is damaged.
         """
         table = self.folder / TABLE
-        with _damaged(table), table.open(newline="", encoding="utf-8") as file:
+        with _on_damage(table), table.open(newline="", encoding="utf-8") as file:
             rows = list(csv.reader(file))
         if rows[:1] != [list(COLUMNS)] or any(len(row) != len(COLUMNS) for row in rows):
             raise DeviceError(f"{table}: is not the table of a collection; give another `out`")
@@ -152,7 +152,7 @@ class Collection:
             os.fsync(file.fileno())
 
 
-def _damaged(file: Path) -> ErrorsAs[Exception]:
+def _on_damage(file: Path) -> ErrorsAs[Exception]:
     """Context of reading a file of a collection, whose errors become a ``DeviceError``."""
     return ErrorsAs((ValueError, csv.Error), lambda error: DeviceError(f"{file}: is damaged ({quote(error)}); give another `out`"))
 

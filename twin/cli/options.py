@@ -205,9 +205,6 @@ def print_result(result: Any) -> None:
     print_lines(f"wrote {path}" for path in getattr(result, "written", ()))
 
 
-Made = TypeVar("Made")
-
-
 class App(typer.Typer):
     """A group of commands."""
 

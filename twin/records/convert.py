@@ -27,7 +27,8 @@ from twin.types import Frame, ReadableResult
 
 WRITERS: dict[str, type[FolderWriter]] = {each.FORMAT: each for each in (RecordingWriter, LeRobotWriter, HuggingFaceWriter, Ros2Writer)}
 """Class that writes each format."""
-READERS = dict(zip(WRITERS, (recording_records, lerobot_records, huggingface_records, ros2_records), strict=True))
+_READ: tuple[Callable[[Path], Records], ...] = (recording_records, lerobot_records, huggingface_records, ros2_records)
+READERS = dict(zip(WRITERS, _READ, strict=True))
 """Function that reads the records of each format."""
 FORMATS = tuple(READERS)
 """Formats that can be written."""

@@ -16,7 +16,7 @@ the areas of the cells sum to that of the region up to rounding errors, for a re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
+from typing import Any
 
 import cv2
 import numpy as np
@@ -152,6 +152,29 @@ def _flip(px: np.ndarray, triangles: np.ndarray, beyond: np.ndarray) -> tuple[np
                     break
         doubtful += [(number, k) for k in range(3) for number in (t, u)]
     return triangles, beyond, flips
+
+
+class Polygons(Sequence[np.ndarray]):
+    """Polygons whose corners are in one array.
+
+    Parameters
+    ----------
+    corners : (V, 2) float
+    first : (n + 1,) int
+        Where each polygon's corners begin.
+    """
+
+    def __init__(self, corners: np.ndarray, first: np.ndarray) -> None:
+        self._corners, self._first = corners, first
+
+    def __len__(self) -> int:
+        return len(self._first) - 1
+
+    def __getitem__(self, k: Any) -> Any:
+        if isinstance(k, slice):
+            return [self[i] for i in range(len(self))[k]]
+        k = range(len(self))[k]
+        return self._corners[self._first[k] : self._first[k + 1]]
 
 
 @dataclass(frozen=True)
@@ -340,8 +363,7 @@ def voronoi(nodes_px: np.ndarray, *, outmost: np.ndarray | None = None, edges: n
     if region is None or not (area > 0).all():
         region = _hull_region(nodes)
         area, store, first = _tile(sites, start, neighbours, region)
-    corners = store + origin
-    cells = [corners[begin:end] for begin, end in pairwise(first.tolist())]
+    cells: Sequence[np.ndarray] = Polygons(store + origin, first)
     if back is not None:
         area, cells = (area / share)[back], [cells[k] for k in back]
     return Tessellation(area, cells, region + origin)

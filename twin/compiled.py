@@ -30,15 +30,15 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
+        # of a generator that was stored by another process, Numba can't compile a caller; code in C calls none
+        chosen: dict[str, Any] = {"cache": not isgeneratorfunction(function), "no_cfunc_wrapper": True} | options
         try:
-            # of a generator that was stored by another process, Numba can't compile a caller; code in C calls none
-            chosen: dict[str, Any] = {"cache": not isgeneratorfunction(function), "no_cfunc_wrapper": True} | options
             dispatcher = numba.njit(**chosen)(function)
         except RuntimeError as error:
             if "cannot cache function" not in str(error):
                 raise
             _warn("no folder for them can be written")
-            return numba.njit(**options)(function)
+            return numba.njit(**chosen | {"cache": False})(function)
         kept = dispatcher._cache  # numba has no public way to continue if it can't save
         save = kept.save_overload
 

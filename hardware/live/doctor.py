@@ -18,7 +18,7 @@ from hardware.ros2.dds import Participant
 from scenes import list_specifications
 from scenes.plugins import plugin_lines
 from twin.errors import EXTRAS, ExtraError, RenderError
-from twin.optics.variants.variant import report
+from twin.optics.variant import report
 from twin.report.skin3d import probe_offscreen
 from twin.store import cache_folder
 from twin.types import ReadableResult

@@ -6,7 +6,7 @@ from twin.camera.projection import project
 from twin.geometry.pins import rest_pins
 from twin.optics.render import BOUNCES, Renderer
 from twin.optics.scene import ScalarView
-from twin.optics.variants.variant import use_variant
+from twin.optics.variant import use_variant
 
 
 class PlainPath:

@@ -7,7 +7,7 @@ import pytest
 from golden_renders import CASES, COMPARED, chance, renders
 from plain_sensor import changed
 
-from twin.optics.variants.variant import choose_variant
+from twin.optics.variant import choose_variant
 
 REFERENCE = Path(__file__).with_name("renders.npz")
 CHANCE = 1e-4  # of refusing a right renderer

@@ -14,7 +14,7 @@ from twin.geometry.pins import rest_pins
 from twin.optics.glass import Window
 from twin.optics.render import Renderer
 from twin.optics.static_layer import ACROSS
-from twin.optics.variants.variant import use_variant
+from twin.optics.variant import use_variant
 
 BOUNCES = 6  # of the bright laboratory: what a seventh brings is below the noise
 CHANCE = 1e-3  # of refusing a right renderer, by blocks or in total

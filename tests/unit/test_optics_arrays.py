@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twin.optics.variants.variant import ROOM_BYTES, with_room
+from twin.optics.variant import ROOM_BYTES, with_room
 
 
 @pytest.mark.parametrize("dtype", [np.uint32, np.float32])

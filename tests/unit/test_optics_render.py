@@ -12,7 +12,7 @@ from twin.errors import RenderError
 from twin.geometry.pins import PinRest, rest_pins
 from twin.optics.render import Renderer
 from twin.optics.sampling import PixelSamples, near_pins
-from twin.optics.variants.variant import choose_variant, use_variant
+from twin.optics.variant import choose_variant, use_variant
 
 BRIGHT = {"pin_albedo": (0.9, 0.9, 0.9), "skin_albedo": (0.8, 0.8, 0.8)}  # many paths go on
 

@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 
 from twin.errors import RenderError
-from twin.optics.variants import variant
-from twin.optics.variants.variant import ProbeResult
+from twin.optics import variant
+from twin.optics.variant import ProbeResult
 
 RENDER_TINY = """
 import sys
 from scenes import load_sensor
 from twin.optics.render import Renderer
-from twin.optics.variants.variant import choose_variant
+from twin.optics.variant import choose_variant
 choice = choose_variant("mono", llvm_search={search})
 image = Renderer(load_sensor("mg400-127"), choice, spp=1, window_px=(290, 250, 322, 282)).render()
 assert image.shape == (32, 32) and image.max() > 0, image
@@ -50,7 +50,7 @@ def old_llvm() -> Path:
 
 
 def test_nothing_heavy_at_import():
-    code = "import sys, twin.optics.variants.variant, twin.optics.render; "
+    code = "import sys, twin.optics.variant, twin.optics.render; "
     code += "print([m for m in ('mitsuba', 'drjit', 'torch') if m in sys.modules])"
     assert in_child(code).strip() == "[]"
 
@@ -72,7 +72,7 @@ def test_one_process_renders_with_one_backend_after_the_other():
 def test_an_llvm_that_aborts_is_refused_and_another_way_is_found(tmp_path):
     """The probe, not the file name, decides about a library the user names."""
     path = old_llvm()
-    code = "import json; from twin.optics.variants.variant import find_llvm; c = find_llvm(())[1][0]; "
+    code = "import json; from twin.optics.variant import find_llvm; c = find_llvm(())[1][0]; "
     code += "print(json.dumps([c.ok, c.reason]))"
     ok, reason = json.loads(in_child(code, DRJIT_LIBLLVM_PATH=str(path), TACTIP_CACHE=str(tmp_path)))
     assert not ok and "signal" in reason

@@ -7,7 +7,7 @@ from scipy.optimize import minimize
 from scenes import load_sensor
 from twin.optics.glass import Window
 from twin.optics.sampling import PixelSamples
-from twin.optics.variants.variant import choose_variant, use_variant
+from twin.optics.variant import choose_variant, use_variant
 
 SINGLE = 2e-5  # relative: single precision through a dozen operations
 GRAZING_DEG = 80.0  # in air; beyond, little light passes and Newton's few steps serve no purpose

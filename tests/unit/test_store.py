@@ -22,8 +22,8 @@ from twin.calibration.optics import _Log
 from twin.errors import StoreError
 from twin.mechanics.skin_fit import FittedPins
 from twin.mechanics.solver import SkinSolver
-from twin.optics.variants import variant
-from twin.optics.variants.variant import ProbeResult
+from twin.optics import variant
+from twin.optics.variant import ProbeResult
 from twin.store import (
     ArrayFile,
     Item,
@@ -57,7 +57,7 @@ KEEPERS = (  # the module of every function whose results are kept between runs
     "twin.mechanics.skin_fit",
     "twin.geometry.solid",
     "twin.optics.preview",
-    "twin.optics.variants.variant",
+    "twin.optics.variant",
     "twin.optics.render",
     "twin.evaluation.degradation.shots",
     "twin.evaluation.degradation.sweep",

@@ -16,7 +16,7 @@ from twin.geometry.solid import Resolution
 from twin.mechanics.skin_map import skin_map
 from twin.mechanics.solver import SkinSolver
 from twin.optics.preview import Shading
-from twin.optics.variants.variant import one_thread
+from twin.optics.variant import one_thread
 from twin.rig.contact import RigContact
 from twin.rig.labels import ArmLabel
 from twin.simulator import Simulator

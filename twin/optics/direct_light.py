@@ -10,7 +10,7 @@ import numpy as np
 
 from scenes.sensor import HousingSpec, LedRingSpec, SensorSpec
 from twin.optics.glass import NumPy, Window
-from twin.optics.variants.variant import DrJit
+from twin.optics.variant import DrJit
 from twin.types import FloatArray
 
 LED_FLUX = 640.0

@@ -12,7 +12,7 @@ import numpy as np
 from scenes.sensor import CameraSpec, ViewSpec
 from twin.camera.projection import distort, sensor_to_camera, undistort
 from twin.optics.sampling import PixelSamples
-from twin.optics.variants.variant import DrJit, with_room
+from twin.optics.variant import DrJit, with_room
 from twin.types import FloatArray
 
 NEWTON_STEPS = 5

@@ -10,7 +10,7 @@ import numpy as np
 from twin.errors import RenderError
 from twin.optics.render import BOUNCES, GelView, Renderer
 from twin.optics.tracer import spectrum
-from twin.optics.variants.variant import DrJit, use_variant, with_room
+from twin.optics.variant import DrJit, use_variant, with_room
 from twin.types import FloatArray, IntArray, PinState
 
 SAMPLES = 32

@@ -17,7 +17,7 @@ from twin.optics.sampling import SKIN_SAVING, PixelSamples, near_pins
 from twin.optics.scene import ScalarView, build_scene, move_meshes
 from twin.optics.surfaces import PaintedSurface, SkinSurface, caps, stems
 from twin.optics.tracer import GelTracer, luminance
-from twin.optics.variants.variant import DrJit, VariantChoice, choose_variant, use_variant, with_room
+from twin.optics.variant import DrJit, VariantChoice, choose_variant, use_variant, with_room
 from twin.store import cached_arrays, write_bytes
 from twin.types import FloatArray, IntArray, PinState, Quality
 
@@ -44,7 +44,7 @@ class Renderer:
     ----------
     spec : SensorSpec
     variant : str or VariantChoice, optional
-        Variant for `twin.optics.variants.variant.choose_variant`. Default: the fastest variant that works.
+        Variant for `twin.optics.variant.choose_variant`. Default: the fastest variant that works.
     quality : {"rasterised", "preview", "standard", "high"}
         A rasterised picture costs a small part of a traced one. Its light is the lamps' direct light, with the shading of a traced frame.
     mesh : SensorMesh, optional

@@ -13,7 +13,7 @@ import numpy as np
 from scenes.sensor import AppearanceSpec, PinsSpec, ViewSpec
 from twin.camera.projection import project
 from twin.geometry.pins import across_axis
-from twin.optics.variants.variant import DrJit
+from twin.optics.variant import DrJit
 from twin.types import BoolArray, PinState
 
 SKIN_SAVING = 4

@@ -18,7 +18,7 @@ from twin.geometry.pins import rest_pins
 from twin.optics.direct_light import Patch, lights
 from twin.optics.surfaces import PaintedSurface, vertex_normals
 from twin.optics.tracer import luminance
-from twin.optics.variants.variant import DrJit, with_room
+from twin.optics.variant import DrJit, with_room
 from twin.types import FloatArray, IntArray, PinState
 
 # Refractive index of the skin and the caps (acrylate rubber).

@@ -13,7 +13,7 @@ from scenes.sensor import SensorSpec
 from twin.optics.direct_light import Patch, lights, received_share
 from twin.optics.glass import Window
 from twin.optics.sampling import PixelSamples
-from twin.optics.variants.variant import DrJit
+from twin.optics.variant import DrJit
 from twin.types import FloatArray
 
 SURVIVAL_GAIN = 4.0

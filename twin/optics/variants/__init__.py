@@ -1,1 +1,0 @@
-"""Mitsuba's variants: which of them work on this machine, and its arrays."""

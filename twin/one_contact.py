@@ -1,8 +1,11 @@
-"""Simulation and rendering of one contact, and a folder with its files and its exact ground truth."""
+"""Simulation and rendering of one contact, and a folder with its files and its exact ground truth.
+
+What draws charts is imported after the contact is pressed and rendered, while another process draws the skin.
+"""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 from scenes import SensorSpec
 from scenes.object import ObjectSpec
@@ -13,12 +16,14 @@ from twin.optics.render import write_exr
 from twin.pins.graph import make_graph
 from twin.pins.pipeline import Pipeline
 from twin.progress import Progress, silent, stage
-from twin.report.charts import ObservedFrame, contact_panel, save_figure
 from twin.report.page import force_interval
 from twin.report.skin3d import SkinPainter, displaced_skin, write_surface
 from twin.simulator import RenderedFrame, Simulator
 from twin.store import made_by, write_json, write_npz, writes
 from twin.types import ContactState, FloatArray, Form, Quality, ReadableResult
+
+if TYPE_CHECKING:
+    from twin.report.charts import ObservedFrame
 
 FILES = ("frame.png", "frame.exr", "truth.npz", "truth.json", "skin.vtp", "skin.png", "panel.png")
 """Files of a contact, in the order in which they are written."""
@@ -40,7 +45,7 @@ class RenderedContact(ReadableResult):
 
     state: ContactState
     rendered: RenderedFrame
-    look: ObservedFrame
+    look: "ObservedFrame"
     written: list[Path]
     stiffness_factor: float
 
@@ -108,11 +113,13 @@ def render_contact(
 
 def write_contact(
     out: Path, simulator: Simulator, obj: ObjectSpec, pose: Pose, state: ContactState, rendered: RenderedFrame, painter: SkinPainter
-) -> tuple[list[Path], ObservedFrame]:
+) -> tuple[list[Path], "ObservedFrame"]:
     """Write all files of one contact into a folder. Returns the files, and what the pipeline sees in the picture.
 
     ``painter`` has begun to draw the contact.
     """
+    from twin.report.charts import contact_panel, save_figure
+
     spec = simulator.spec
     write_image(out / "frame.png", rendered.frame.image)
     write_exr(out / "frame.exr", rendered.linear, simulator.renderer.choice)
@@ -134,8 +141,10 @@ def contact_arrays(state: ContactState) -> dict[str, FloatArray]:
     return {f"contact_{name.removeprefix('contact_')}": getattr(state, name) for name in names}
 
 
-def look_at(simulator: Simulator, rendered: RenderedFrame) -> ObservedFrame:
+def look_at(simulator: Simulator, rendered: RenderedFrame) -> "ObservedFrame":
     """Run the pipeline on a rendered frame. The graph without contact is that of the pins' true places at rest."""
+    from twin.report.charts import ObservedFrame
+
     pipeline = Pipeline(simulator.spec, rendered.frame.form)
     pipeline(rendered.frame)  # first: it loads compiled code, which must not count in its times
     rest = make_graph(pipeline.graph, rendered.truth.rest_px, outmost=pipeline.reference.outmost)

@@ -165,6 +165,31 @@ def test_imports_are_followed_within_functions_and_through_packages(tmp_path):
     assert set(found.libraries) == {"numpy", "torch"}
 
 
+@pytest.mark.parametrize("damage", ["", "[1, 2]", "{", '{"FILE": {"KEY": 7}}', '{"FILE": {"KEY": ["0", [["twin.b"]], {}]}}'])
+def test_what_was_found_in_a_module_is_stored_and_never_older_than_its_source(tmp_path, monkeypatch, damage):
+    def in_a_new_process() -> dict[str, str]:
+        for known in (code._parsed, code._read_module, code._code):
+            known.cache_clear()
+        return dict(code_of("twin.a", root=tmp_path).modules)
+
+    code = sys.modules["twin.store.fingerprint"]
+    monkeypatch.setenv("TACTIP_CACHE", str(tmp_path / "cache"))
+    package(tmp_path, twin__a="from twin.b import f\n", twin__b="def f():\n    return 1\n")
+    first = in_a_new_process()
+    stored = tmp_path / "cache" / "modules.json"
+    with monkeypatch.context() as patch:
+        patch.setattr(code, "_parse", None)
+        assert in_a_new_process() == first
+    if damage:
+        file = str(tmp_path / "twin" / "a.py")
+        (key,) = json.loads(stored.read_text())[file]
+        stored.write_text(damage.replace("FILE", file).replace("KEY", key))
+        assert in_a_new_process() == first
+    package(tmp_path, twin__b="def f():\n    return 2\n")
+    second = in_a_new_process()
+    assert second["twin.a"] == first["twin.a"] and second["twin.b"] != first["twin.b"]
+
+
 def test_functions_methods_and_partials_stand_for_their_modules():
     wanted = fingerprint("twin.mechanics.solver")
     assert wanted == fingerprint(SkinSolver) == fingerprint(SkinSolver.press) == fingerprint(partial(SkinSolver, None))

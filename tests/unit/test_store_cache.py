@@ -33,7 +33,7 @@ class Work:
 
 
 def entries(folder) -> list:
-    return sorted(folder.iterdir())
+    return sorted(path for path in folder.iterdir() if path.name != "modules.json")
 
 
 def assert_right(found, work):
@@ -198,10 +198,10 @@ def test_off_touches_no_disk(tmp_path, monkeypatch):
 
 
 def test_without_a_choice_the_users_cache_folder_is_taken(tmp_path, monkeypatch):
-    monkeypatch.setattr(cache.platformdirs, "user_cache_dir", lambda name: str(tmp_path / name))
+    monkeypatch.setattr(atomic.platformdirs, "user_cache_dir", lambda name: str(tmp_path / name))
     for unset in (lambda: monkeypatch.delenv("TACTIP_CACHE", raising=False), lambda: monkeypatch.setenv("TACTIP_CACHE", "")):
         unset()
-        assert cache.cache_folder() == tmp_path / "tactip-twin"
+        assert atomic.cache_folder() == tmp_path / "tactip-twin"
 
 
 def test_the_longest_unused_entries_go_first_and_strangers_stay(folder, monkeypatch):

@@ -174,6 +174,8 @@ def object_surface(
     low, high = np.array(bounds_mm[::2], float), np.array(bounds_mm[1::2], float)
     grid = pv.ImageData(dimensions=(samples,) * 3, spacing=tuple((high - low) / (samples - 1)), origin=tuple(low))
     T_object_sensor = np.linalg.inv(T_sensor_object)
-    in_object = grid.points @ T_object_sensor[:3, :3].T + T_object_sensor[:3, 3]
-    grid["distance_mm"] = distance(in_object)
+    along = np.linspace(low, high, samples)
+    x, y, z = (along[:, [k]] * T_object_sensor[:3, k] for k in range(3))
+    in_object = z[:, None, None] + y[:, None] + x + T_object_sensor[:3, 3]
+    grid["distance_mm"] = distance(in_object.reshape(-1, 3))
     return grid.contour([0.0], scalars="distance_mm")

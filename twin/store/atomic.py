@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+import platformdirs
 
 from twin.errors import ErrorsAs, StoreError
 
@@ -33,6 +34,8 @@ PART = ".part"
 """End of the name of a temporary file. The name begins with a dot."""
 LOCK = ".lock"
 """Name of the file that is locked where the file system (NFS) can't lock a folder itself. Earlier versions left one in each folder."""
+CACHE_VARIABLE = "TACTIP_CACHE"
+"""Environment variable with another folder for results that are kept between runs, or ``off``."""
 LOOK_S = 0.05
 """Interval, s, at which a run that waits for another one looks again."""
 
@@ -118,6 +121,14 @@ def write_npz(path: Path, arrays: Mapping[str, np.ndarray], *, compressed: bool 
     """Write arrays by name in the format that ``np.load`` reads; raises as ``write_with``."""
     save: Callable[..., None] = np.savez_compressed if compressed else np.savez
     return write_with(path, lambda file: save(file, **arrays))
+
+
+def cache_folder() -> Path | None:
+    """Folder of results that are kept between runs; None if the cache is off."""
+    chosen = os.environ.get(CACHE_VARIABLE, "")
+    if chosen.lower() == "off":
+        return None
+    return Path(chosen) if chosen else Path(platformdirs.user_cache_dir("tactip-twin"))
 
 
 def make_folder(folder: Path) -> Path:

@@ -12,13 +12,11 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-import platformdirs
 
 from twin.errors import StoreError, warn_once
-from twin.store.atomic import write_npz
+from twin.store.atomic import CACHE_VARIABLE, cache_folder, write_npz
 from twin.store.fingerprint import Maker, UnknownCodeError, fingerprint, inputs_digest
 
-_VARIABLE = "TACTIP_CACHE"
 _FORMAT = 2  # version of the files' format; it is increased if older files must not be read
 _LIMIT_BYTES = 1_000_000_000  # largest size of all entries together; entries that were unused longest are removed first
 _ENTRY = r"[\w-]+-[0-9a-f]{64}\.npz"
@@ -66,14 +64,6 @@ def cached_arrays(
     return found
 
 
-def cache_folder() -> Path | None:
-    """Folder of the entries; None if the cache is off."""
-    chosen = os.environ.get(_VARIABLE, "")
-    if chosen.lower() == "off":
-        return None
-    return Path(chosen) if chosen else Path(platformdirs.user_cache_dir("tactip-twin"))
-
-
 def _arrays(compute: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     found = {name: np.asarray(value) for name, value in compute().items()}
     if any(value.dtype.hasobject for value in found.values()):
@@ -104,7 +94,7 @@ def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
     except (OSError, StoreError) as error:
         reason = error.__cause__ if isinstance(error, StoreError) else error
         why = getattr(reason, "strerror", None) or reason
-        warn_once(f"{path.parent}: results can't be kept ({why}); set {_VARIABLE} to a writable folder, or to off")
+        warn_once(f"{path.parent}: results can't be kept ({why}); set {CACHE_VARIABLE} to a writable folder, or to off")
 
 
 def _make_room(folder: Path) -> None:

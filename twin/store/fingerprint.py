@@ -6,6 +6,8 @@ strings that stand alone, which are docstrings and explanations of constants, an
 that raises has no result. Comments and formatting are not in the tree. Therefore a changed formula changes the fingerprint, and a changed
 explanation or error does not. The texts of the command line are in ``twin.cli``, which no computing module imports.
 
+To parse all modules takes a quarter of a second. So what a module held is stored in the cache folder, by the digest of its source.
+
 ``made_by`` is the record that every output has of this code, with the digest of its inputs.
 """
 
@@ -16,6 +18,7 @@ import inspect
 import json
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from datetime import UTC, datetime
 from functools import cache, cached_property, partial
@@ -27,6 +30,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from twin.errors import StoreError
+from twin.store.atomic import cache_folder, make_folder, write_json
 
 PACKAGES = ("scenes", "twin", "training", "hardware")
 ROOT = Path(__file__).parents[2]  # the folder that the packages lie in
@@ -43,6 +47,7 @@ LIBRARIES = {  # import name -> distribution, for libraries whose version may ch
     "trimesh": "trimesh",
 }
 
+_PARSED = "modules.json"  # file in the cache folder
 _From = tuple[str, str | None]  # a module, and the name that is taken from it (None: the module itself)
 Maker = Callable[..., Any] | str  # a function, a class, or the name of a module
 
@@ -131,6 +136,7 @@ def _unwrap(maker: Maker) -> Maker:
 
 @cache
 def _code(root: Path, starts: tuple[str, ...]) -> CodeOf:
+    before = dict(_parsed())
     modules, libraries, waiting = {}, set(), [(name, _file_of(root, name)) for name in starts]
     while waiting:
         name, file = waiting.pop()
@@ -146,6 +152,10 @@ def _code(root: Path, starts: tuple[str, ...]) -> CodeOf:
                 libraries.add(LIBRARIES[top])
             elif top in PACKAGES:
                 waiting += [(each, _source(root, each)) for each in _resolve_import(root, imported, asked)]
+    folder = cache_folder()
+    if folder is not None and before != _parsed():
+        with suppress(StoreError):
+            write_json(make_folder(folder) / _PARSED, {file: found for file, found in _parsed().items() if Path(file).is_file()})
     return CodeOf(modules, {name: _version(name) for name in libraries})
 
 
@@ -190,18 +200,40 @@ class _Module:
 
 @cache
 def _read_module(root: Path, file: Path, name: str) -> _Module:
+    try:
+        source = file.read_bytes()
+        key = hashlib.sha256(b"\0".join([Path(__file__).read_bytes(), sys.version.encode(), name.encode(), source])).hexdigest()
+        with suppress(LookupError, TypeError, ValueError):  # not stored, or damaged
+            digest, imports, names = _parsed()[str(file)][key]
+            return _Module(
+                digest, tuple((of, asked) for of, asked in imports), {called: (of, asked) for called, (of, asked) in names.items()}
+            )
+        found = _parse(source.decode(), name, file.name == "__init__.py")
+    except (OSError, SyntaxError, UnicodeDecodeError) as error:
+        raise UnknownCodeError(f"{file}: not readable ({error}); install the program again") from error
+    _parsed()[str(file)] = {key: list(vars(found).values())}
+    return found
+
+
+def _parse(source: str, name: str, is_package: bool) -> _Module:
     collecting = gc.isenabled()
     gc.disable()  # a syntax tree has many small objects, and garbage collection would double the time
     try:
-        tree = ast.parse(file.read_text(encoding="utf-8"))
-        imports, names = _imports(tree, name, file.name == "__init__.py")
-        digest = hashlib.sha256(_bare(tree).encode()).hexdigest()
-    except (OSError, SyntaxError, UnicodeDecodeError) as error:
-        raise UnknownCodeError(f"{file}: not readable ({error}); install the program again") from error
+        tree = ast.parse(source)
+        imports, names = _imports(tree, name, is_package)
+        return _Module(hashlib.sha256(_bare(tree).encode()).hexdigest()[:16], imports, names)
     finally:
         if collecting:
             gc.enable()
-    return _Module(digest[:16], imports, names)
+
+
+@cache
+def _parsed() -> dict[str, Any]:
+    """What was found in files, by file and digest of the source: by earlier processes, and by this one."""
+    folder = cache_folder()
+    with suppress(OSError, ValueError, TypeError):
+        return dict(json.loads((folder / _PARSED).read_text("utf-8"))) if folder else {}
+    return {}
 
 
 def _imports(tree: ast.Module, module: str, is_package: bool) -> tuple[tuple[_From, ...], dict[str, _From]]:

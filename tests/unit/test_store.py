@@ -168,7 +168,7 @@ def test_imports_are_followed_within_functions_and_through_packages(tmp_path):
 @pytest.mark.parametrize("damage", ["", "[1, 2]", "{", '{"FILE": {"KEY": 7}}', '{"FILE": {"KEY": ["0", [["twin.b"]], {}]}}'])
 def test_what_was_found_in_a_module_is_stored_and_never_older_than_its_source(tmp_path, monkeypatch, damage):
     def in_a_new_process() -> dict[str, str]:
-        for known in (code._parsed, code._read_module, code._code):
+        for known in (code._known_modules, code._read_module, code._code):
             known.cache_clear()
         return dict(code_of("twin.a", root=tmp_path).modules)
 

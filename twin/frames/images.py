@@ -35,6 +35,8 @@ ORIENTATION, UPRIGHT = 0x0112, 1
 """EXIF's tag of the orientation (CIPA DC-008), and its value for pictures that are shown as they are stored."""
 NOT_TURNED = "an orientation flag ({}) is not applied: pixels are taken as they are stored"
 """Note on a picture or video that a player would show turned or mirrored."""
+Pictures = Iterator[tuple[int, np.ndarray | str, float]]
+"""Index of each frame, its picture, or the reason why it can't be used, and its time, s."""
 ADDED_BYTES = re.compile(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9")
 """The JPEG decoder's message about extra bytes after a complete picture. Some cameras add such bytes."""
 DAMAGE = re.compile(

@@ -16,9 +16,8 @@ import numpy as np
 
 from scenes.files import read_regular
 from twin.errors import ErrorsAs, FrameError, library
-from twin.frames.images import picture_of
+from twin.frames.images import Pictures, picture_of
 from twin.frames.tables import LARGEST_BYTES, called_here
-from twin.frames.videos import Pictures, open_video
 
 INFO, DATA, EPISODES = Path("meta", "info.json"), "data/chunk-*/*.parquet", "meta/episodes/chunk-*/*.parquet"
 """Paths of a data set's description, of its tables of frames and of its tables of episodes."""
@@ -101,6 +100,8 @@ class LeRobotFrames:
                 yield index_of[row], image, time_s
 
     def _from_video(self, path: Path, rows: Collection[int]) -> Pictures:
+        from twin.frames.videos import open_video  # its library takes time to load
+
         video, found = open_video(path), set()
         self.problems += [problem for problem in video.problems if problem not in self.problems]
         for row, image, _ in video.frames(rows):

@@ -13,10 +13,9 @@ from scenes.sensor import SensorSpec
 from twin.errors import FrameError
 from twin.frames.folders import IMAGE_FOLDERS, VIDEO_SUFFIXES, frames_in, image_folders, odd_entries, references_in, the_video_in
 from twin.frames.forms import FrameKind, common_kind, form_named, form_of, times
-from twin.frames.images import read_image
+from twin.frames.images import Pictures, read_image
 from twin.frames.lerobot import INFO, RESTS, LeRobotFrames, is_lerobot
 from twin.frames.tables import TABLES, describe_count, order_by_table, read_metadata, unlikely_units
-from twin.frames.videos import Pictures, open_video
 from twin.types import Form, Frame
 
 MOST_NAMED = 20  # most columns that a message names; the widest tables in use have about 40
@@ -203,6 +202,8 @@ class Recording:
 
 
 def _open_video(path: Path, spec: SensorSpec | None, form: Form | None) -> Recording:
+    from twin.frames.videos import open_video  # its library takes time to load
+
     video = open_video(path)
     names = [f"{path.stem}_{k:06d}" for k in range(video.count)]
     told = form_of(video.first, path.name, spec, form)

@@ -23,7 +23,7 @@ from av.video.stream import VideoStream
 from scenes.files import quote, require_regular
 from twin.errors import ErrorsAs, FrameError, format_count
 from twin.frames.forms import times
-from twin.frames.images import NOT_TURNED, picture_of
+from twin.frames.images import NOT_TURNED, Pictures, picture_of
 
 MOTION_JPEG = "mjpeg"
 """FFmpeg's name of the codec whose frames are JPEG pictures."""
@@ -39,8 +39,6 @@ MOST_SAID = 3
 """Most reasons against frames that are stated, the most frequent ones."""
 PAUSE = 3.0
 """A pause is longer than this many times the usual time from frame to frame."""
-Pictures = Iterator[tuple[int, np.ndarray | str, float]]
-"""Index of each frame, its picture, or the reason why it can't be used, and its time, s."""
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ LIBRARIES = {  # import name -> distribution, for libraries whose version may ch
     "trimesh": "trimesh",
 }
 
-_PARSED = "modules.json"  # file in the cache folder
+_KNOWN = "modules.json"  # file in the cache folder
 _From = tuple[str, str | None]  # a module, and the name that is taken from it (None: the module itself)
 Maker = Callable[..., Any] | str  # a function, a class, or the name of a module
 
@@ -136,7 +136,7 @@ def _unwrap(maker: Maker) -> Maker:
 
 @cache
 def _code(root: Path, starts: tuple[str, ...]) -> CodeOf:
-    before = dict(_parsed())
+    before = dict(_known_modules())
     modules, libraries, waiting = {}, set(), [(name, _file_of(root, name)) for name in starts]
     while waiting:
         name, file = waiting.pop()
@@ -153,9 +153,9 @@ def _code(root: Path, starts: tuple[str, ...]) -> CodeOf:
             elif top in PACKAGES:
                 waiting += [(each, _source(root, each)) for each in _resolve_import(root, imported, asked)]
     folder = cache_folder()
-    if folder is not None and before != _parsed():
+    if folder is not None and before != _known_modules():
         with suppress(StoreError):
-            write_json(make_folder(folder) / _PARSED, {file: found for file, found in _parsed().items() if Path(file).is_file()})
+            write_json(make_folder(folder) / _KNOWN, {file: found for file, found in _known_modules().items() if Path(file).is_file()})
     return CodeOf(modules, {name: _version(name) for name in libraries})
 
 
@@ -204,14 +204,14 @@ def _read_module(root: Path, file: Path, name: str) -> _Module:
         source = file.read_bytes()
         key = hashlib.sha256(b"\0".join([Path(__file__).read_bytes(), sys.version.encode(), name.encode(), source])).hexdigest()
         with suppress(LookupError, TypeError, ValueError):  # not stored, or damaged
-            digest, imports, names = _parsed()[str(file)][key]
+            digest, imports, names = _known_modules()[str(file)][key]
             return _Module(
                 digest, tuple((of, asked) for of, asked in imports), {called: (of, asked) for called, (of, asked) in names.items()}
             )
         found = _parse(source.decode(), name, file.name == "__init__.py")
     except (OSError, SyntaxError, UnicodeDecodeError) as error:
         raise UnknownCodeError(f"{file}: not readable ({error}); install the program again") from error
-    _parsed()[str(file)] = {key: list(vars(found).values())}
+    _known_modules()[str(file)] = {key: list(vars(found).values())}
     return found
 
 
@@ -228,11 +228,11 @@ def _parse(source: str, name: str, is_package: bool) -> _Module:
 
 
 @cache
-def _parsed() -> dict[str, Any]:
+def _known_modules() -> dict[str, Any]:
     """What was found in files, by file and digest of the source: by earlier processes, and by this one."""
     folder = cache_folder()
     with suppress(OSError, ValueError, TypeError):
-        return dict(json.loads((folder / _PARSED).read_text("utf-8"))) if folder else {}
+        return dict(json.loads((folder / _KNOWN).read_text("utf-8"))) if folder else {}
     return {}
 
 

@@ -23,7 +23,7 @@ $(VENV)/.installed: pyproject.toml requirements.lock
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { echo "no venv: install python3-venv, remove $(VENV) and run make again"; exit 1; }
 	@echo "installing Python packages into $(VENV) (3 to 7 GB, a few minutes the first time; docs/install.md says how to have the smaller)"
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c requirements.lock -e '.[dev]'
-	@$(BIN)/python -m compileall -q -j 0 $(VENV)/lib >/dev/null 2>&1 || true # on all cores, where pip uses one; some libraries ship files for other Pythons
+	@$(BIN)/python -m compileall -q -j 0 -x '/tests?/' $(VENV)/lib >/dev/null 2>&1 || true # on all cores, where pip uses one; some libraries ship files for other Pythons
 	@$(BIN)/twin doctor --prepare >/dev/null 2>&1 || true # compiles ahead, half a minute
 	@touch $@
 

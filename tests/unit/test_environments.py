@@ -320,6 +320,8 @@ def test_wrong_calls_are_named():
         env.reset(options={"colour": "red"})
     with pytest.raises(OptionError, match="object=3"):
         env.reset(options={"object": 3})
+    with pytest.raises(OptionError, match="expected a dict, such as"):
+        env.reset(options=["can"])
     with pytest.raises(OptionError, match="did you mean 'SurfaceFollow'"):
         TactileEnv("surfacefollow")
     env.reset(seed=0)

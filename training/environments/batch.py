@@ -253,6 +253,8 @@ class Batch:
 
     def begin(self, row: int, rng: np.random.Generator, wanted: Mapping[str, Any] | None = None) -> None:
         """Draw an episode of one environment: object, friction, sensor, start and goal. ``settle`` then makes the first contact."""
+        if not isinstance(wanted, Mapping | None):
+            raise OptionError(f"reset(options={quote(repr(wanted))}): expected a dict, such as {{'object': 'can'}}")
         wanted = dict(wanted or {})
         for name in wanted:
             if name not in RESET_OPTIONS:

@@ -123,7 +123,11 @@ def window_tangent(view: ViewSpec, rho_mm: FloatArray, z_mm: FloatArray, *, behi
     back, front, z = view.lens.back_mm, view.lens.z_mm, np.asarray(z_mm, float)
     air = np.minimum(z, back) - (-view.camera.distance_mm if behind_mm is None else behind_mm)
     whole = np.broadcast_arrays(np.asarray(rho_mm, float), air, np.clip(z, back, front) - back, np.maximum(z - front, 0))
-    return _tangents(*(each.ravel() for each in whole), view.lens.refractive_index, view.gel_index).reshape(whole[0].shape)
+    rho, air, window, gel = (each.ravel() for each in whole)
+    n_window, n_gel = view.lens.refractive_index, view.gel_index
+    u = rho / (air + window / n_window + gel / n_gel)
+    _refine_tangents(rho, air, window, gel, n_window, n_gel, u, np.ones(len(rho)))
+    return u.reshape(whole[0].shape)
 
 
 def pixel_rays(view: ViewSpec, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -196,14 +200,16 @@ def lens_disc(view: ViewSpec, housing: HousingSpec) -> Disc:
 
 
 @compiled(error_model="numpy")
-def _tangents(rho: FloatArray, air: FloatArray, window: FloatArray, gel: FloatArray, n_window: float, n_gel: float) -> FloatArray:
-    """Tangents (k,) of the angle in air of rays that reach rho (k,) through three layers, by Newton's method.
+def _refine_tangents(
+    rho: FloatArray, air: FloatArray, window: FloatArray, gel: FloatArray, n_window: float, n_gel: float, u: FloatArray, moves: FloatArray
+) -> None:
+    """Tangents ``u`` (k,) of the angle in air of rays that reach rho (k,) through three layers, by Newton's method.
 
-    The steps of all rays are one loop without branches, which the compiler turns into vector instructions.
+    The steps of all rays that still move (k,) are one loop without branches, which the compiler turns into vector instructions.
     """
-    u, moves = rho / (air + window / n_window + gel / n_gel), np.ones(len(rho))
     a, b = n_window * n_window, n_gel * n_gel
     for _ in range(NEWTON_STEPS):
+        moving = 0
         for k in range(len(rho)):
             p, q = a + (a - 1) * u[k] * u[k], b + (b - 1) * u[k] * u[k]  # tan(theta) = u / sqrt(p)
             root_p, root_q = np.sqrt(p), np.sqrt(q)
@@ -213,9 +219,9 @@ def _tangents(rho: FloatArray, air: FloatArray, window: FloatArray, gel: FloatAr
             after = min(max(u[k] + step, 0.0), GRAZING)
             u[k] = after if moves[k] > 0 else u[k]
             moves[k] = moves[k] if abs(step) > 1e-15 * (1.0 + after) else 0.0
-        if not moves.any():
+            moving += moves[k] > 0
+        if not moving:
             break
-    return u
 
 
 def _fisheye(camera: CameraSpec, angle: FloatArray) -> FloatArray:

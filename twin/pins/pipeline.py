@@ -8,6 +8,7 @@ from copy import copy
 from dataclasses import replace
 from time import perf_counter
 
+import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -340,9 +341,11 @@ class Pipeline:
         scale = self.reference.rim_scale(nodes_px)
         if not 1 / MAX_RIM_SCALE < scale < MAX_RIM_SCALE:
             return f"inconsistent pins: the rim is {scale:.2f} times its size at rest; another sensor's frame, or a contact too deep"
-        center = nodes_px.mean(axis=0)
-        radius = np.linalg.norm(nodes_px - center, axis=1).max()
-        extra = int((np.linalg.norm(extra_px - center, axis=1) < radius).sum())
+        extra = 0
+        if len(extra_px):
+            center = nodes_px.mean(axis=0)
+            radius = np.linalg.norm(nodes_px - center, axis=1).max()
+            extra = int((np.linalg.norm(extra_px - center, axis=1) < radius).sum())
         if extra > n or (extra > MAX_EXTRA * n and found < NEARLY_ALL * n):
             return f"too many blobs: {extra} among the {found} pins found; another sensor's frame, or clutter"
         rim = self.reference.outmost[~self._cut_off(nodes_px)[self.reference.outmost]]
@@ -367,54 +370,52 @@ class Pipeline:
         return ""
 
 
-@compiled()
-def _level(gray: np.ndarray, x: float, y: float) -> float:
-    """Mean level of the 3 x 3 pixels around the one nearest to a place, rounded. The picture is mirrored beyond its border."""
-    height, width = gray.shape
-    column, row, total = min(max(round(x), 0), width - 1), min(max(round(y), 0), height - 1), 0
-    inside = 0 < column < width - 1 and 0 < row < height - 1
-    for j in range(row - 1, row + 2):
-        for i in range(column - 1, column + 2):
-            if inside:
-                total += gray[j, i]
-            else:
-                total += gray[abs(j) if j < height else 2 * height - 2 - j, abs(i) if i < width else 2 * width - 2 - i]
-    return round(total / 9)
+@compiled(error_model="numpy")
+def _heights(wide: np.ndarray, pins_px: np.ndarray, near: np.ndarray, darker: float, between: np.ndarray, above: np.ndarray) -> None:
+    """Height (N,) of each pin, see ``NEAREST``: NaN where unknown.
 
-
-@compiled()
-def _percentile(values: np.ndarray, percent: float) -> float:
-    """As ``np.percentile``, of sorted values (n,)."""
-    rank = (len(values) - 1) * (percent / 100)
-    low = int(rank)
-    return values[low] + (rank - low) * (values[min(low + 1, len(values) - 1)] - values[low])
-
-
-@compiled()
-def share_between(gray: np.ndarray, pins_px: np.ndarray, near: np.ndarray, darker: float, bright: float) -> float:
-    """Share of the pins (N, 2), NaN where lost, that stand between caps; ``near`` (N, k) are the pins with which each is compared.
-
-    See ``NEAREST`` for the test and the percentiles.
+    A level is the rounded mean of the 3 x 3 pixels around the one nearest to a place; ``wide`` is the picture with one more pixel on each
+    side. ``between`` (k + 1,) is for work.
     """
-    above, between, count = np.empty(len(pins_px)), np.empty(near.shape[1]), 0
+    last_row, last_column, most = wide.shape[0] - 3, wide.shape[1] - 3, near.shape[1]
     for i in range(len(pins_px)):
-        x, y = pins_px[i]
-        compared = 0
-        for k in near[i]:
-            if np.isfinite(x + pins_px[k, 0]):
-                level, place = _level(gray, (x + pins_px[k, 0]) / 2, (y + pins_px[k, 1]) / 2), compared
+        compared, level = 0, 0.0
+        for c in range(most + 1):  # the pin itself at last
+            k = near[i, c] if c < most else i
+            x, y = (pins_px[i, 0] + pins_px[k, 0]) / 2, (pins_px[i, 1] + pins_px[k, 1]) / 2
+            if not np.isfinite(x):
+                continue
+            column, row, total = min(max(round(x), 0), last_column), min(max(round(y), 0), last_row), 0
+            for r in range(row, row + 3):
+                total += wide[r, column] + wide[r, column + 1] + wide[r, column + 2]
+            level, place = round(total / 9), compared
+            if c < most:
                 while place > 0 and between[place - 1] > level:  # they stay sorted
                     between[place] = between[place - 1]
                     place -= 1
                 between[place] = level
                 compared += 1
+        above[i] = np.nan
         if compared:
-            above[count] = _level(gray, x, y) - _percentile(between[:compared], darker)
-            count += 1
-    if not count:
+            between[compared] = between[compared - 1]
+            rank = (compared - 1) * (darker / 100)
+            low = int(rank)
+            above[i] = level - (between[low] + (rank - low) * (between[low + 1] - between[low]))
+
+
+def share_between(gray: np.ndarray, pins_px: np.ndarray, near: np.ndarray, darker: float, bright: float) -> float:
+    """Share of the pins (N, 2), NaN where lost, that stand between caps; ``near`` (N, k) are the pins with which each is compared.
+
+    See ``NEAREST`` for the test and the percentiles.
+    """
+    above, wide = np.empty(len(pins_px)), cv2.copyMakeBorder(gray, 1, 1, 1, 1, cv2.BORDER_REFLECT_101)
+    _heights(wide, pins_px, near, float(darker), np.empty(near.shape[1] + 1), above)
+    above = np.sort(above[np.isfinite(above)])
+    if not len(above):
         return 0.0
-    least = LEAST_ABOVE * _percentile(np.sort(above[:count]), bright)
-    return (above[:count] <= least).sum() / count
+    low, part = divmod((len(above) - 1) * (bright / 100), 1)
+    level = above[int(low)] + part * (above[min(int(low) + 1, len(above) - 1)] - above[int(low)])  # as np.percentile, which is slow
+    return float(np.count_nonzero(above <= LEAST_ABOVE * level) / len(above))
 
 
 def _extra(blobs: Blobs, found: Match) -> int:

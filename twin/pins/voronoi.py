@@ -57,7 +57,11 @@ class Net:
     @cached_property
     def edges(self) -> np.ndarray:
         """Directed edges (E, 2) of the triangles, as ``directed_edges`` gives them."""
-        return directed_edges(self.triangles, self.triangles.max())
+        n = int(self.triangles.max())
+        joined = np.zeros((n + 1, n + 1), bool)
+        joined[self.triangles, self.triangles[:, (1, 2, 0)]] = True  # each side is that of two triangles, once in each direction
+        joined[:, n] = False
+        return np.column_stack(np.divmod(np.flatnonzero(joined[:n]), n + 1))
 
     def move(self, px: np.ndarray) -> "Net | None":
         """The net of the Delaunay triangles of nodes (n, 2) that moved.
@@ -66,7 +70,8 @@ class Net:
         """
         if self.px is not None and np.array_equal(px, self.px):
             return self
-        triangles, beyond, flips = _flip(px, self.triangles, self.beyond)
+        triangles, beyond = self.triangles.copy(), self.beyond.copy()
+        flips = _flip(px, triangles, beyond, np.ones(len(triangles), bool))
         if flips < 0:
             return None
         found = Net(triangles, beyond, px)
@@ -97,61 +102,62 @@ def net_of(triangles: np.ndarray, n: int) -> Net | None:
     return Net(whole, np.array(beyond))
 
 
-@compiled()
-def double_area(px: np.ndarray, a: int, b: int, c: int) -> float:
-    """Twice the signed area of a triangle of three of the points (N, 2)."""
-    return (px[b, 0] - px[a, 0]) * (px[c, 1] - px[a, 1]) - (px[b, 1] - px[a, 1]) * (px[c, 0] - px[a, 0])
+@compiled(error_model="numpy")
+def _flip(px: np.ndarray, triangles: np.ndarray, beyond: np.ndarray, due: np.ndarray) -> int:
+    """Make a net Delaunay by flips, in its triangles and neighbours (t, 3), and count them: -1 if that is not possible.
 
-
-@compiled()
-def _inside(px: np.ndarray, p: int, q: int, r: int, s: int) -> float:
-    """How far node s lies inside the circle through p, q, r, relative to the size of both: positive if the side q r has to be flipped."""
-    n = len(px)
-    if p == n or s == n:
-        return -1.0
-    ax, ay = px[p, 0] - px[s, 0], px[p, 1] - px[s, 1]
-    if q == n or r == n:  # the circle is a straight line
-        area = double_area(px, p, s, r) if q == n else double_area(px, p, q, s)
-        return area / (ax * ax + ay * ay)
-    bx, by, cx, cy = px[q, 0] - px[s, 0], px[q, 1] - px[s, 1], px[r, 0] - px[s, 0], px[r, 1] - px[s, 1]
-    a2, b2, c2 = ax * ax + ay * ay, bx * bx + by * by, cx * cx + cy * cy
-    return (ax * (by * c2 - b2 * cy) - ay * (bx * c2 - b2 * cx) + a2 * (bx * cy - by * cx)) / (a2 + b2 + c2) ** 2
-
-
-@compiled()
-def _flip(px: np.ndarray, triangles: np.ndarray, beyond: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Triangles and neighbours (t, 3) of a net after flips that make it Delaunay, and the number of flips: -1 if that is not possible."""
-    n = len(px)
-    triangles, beyond = triangles.copy(), beyond.copy()
-    for a, b, c in triangles:
-        if max(a, b, c) < n and double_area(px, a, b, c) <= 0:
-            return triangles, beyond, -1
-    doubtful = [(t, k) for t in range(len(triangles)) for k in range(3) if t < beyond[t, k]]
-    flips = 0
-    while doubtful:
-        t, i = doubtful.pop()
-        u = beyond[t, i]
-        j = 0
-        while beyond[u, j] != t:
-            j += 1
-        p, q, r, s = triangles[t, i], triangles[t, (i + 1) % 3], triangles[t, (i + 2) % 3], triangles[u, j]
-        inside = _inside(px, p, q, r, s)
-        if abs(inside) < AMBIGUOUS or flips > MOST_FLIPS * len(triangles):
-            return triangles, beyond, -1
-        if inside < 0:
-            continue
-        flips += 1
-        beside_t, opposite = beyond[t, (i + 1) % 3], beyond[u, (j + 1) % 3]  # beyond r p, and beyond q s
-        triangles[t, (i + 2) % 3], triangles[u, (j + 2) % 3] = s, p
-        beyond[t, i], beyond[u, j] = opposite, beside_t
-        beyond[t, (i + 1) % 3], beyond[u, (j + 1) % 3] = u, t
-        for one, other, new in ((opposite, u, t), (beside_t, t, u)):
-            for k in range(3):
-                if beyond[one, k] == other:
-                    beyond[one, k] = new
-                    break
-        doubtful += [(number, k) for k in range(3) for number in (t, u)]
-    return triangles, beyond, flips
+    A side is tested as soon as one of its triangles is no longer ``due`` (t,) bool: at first all are. A flip makes both due again.
+    """
+    n, flips, changed = len(px), 0, True
+    for t in range(len(triangles)):
+        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        if max(a, b, c) < n and (px[b, 0] - px[a, 0]) * (px[c, 1] - px[a, 1]) <= (px[b, 1] - px[a, 1]) * (px[c, 0] - px[a, 0]):
+            return -1
+    while changed:
+        changed = False
+        for t in range(len(triangles)):
+            i = 0 if due[t] else 3
+            due[t] = False
+            while i < 3:
+                first, second = i, i + 1 if i < 2 else 0
+                third, u = 3 - first - second, beyond[t, i]
+                i += 1
+                if due[u]:
+                    continue
+                j = 0
+                while beyond[u, j] != t:
+                    j += 1
+                p, q, r, s = triangles[t, first], triangles[t, second], triangles[t, third], triangles[u, j]
+                inside = -1.0  # how far s lies inside the circle through p, q, r, relative to the size of both
+                if p < n and s < n:
+                    ax, ay = px[p, 0] - px[s, 0], px[p, 1] - px[s, 1]
+                    a2 = ax * ax + ay * ay
+                    if q == n:  # the circle is a straight line
+                        inside = (ay * (px[r, 0] - px[s, 0]) - ax * (px[r, 1] - px[s, 1])) / a2
+                    elif r == n:
+                        inside = (ax * (px[q, 1] - px[s, 1]) - ay * (px[q, 0] - px[s, 0])) / a2
+                    else:
+                        bx, by, cx, cy = px[q, 0] - px[s, 0], px[q, 1] - px[s, 1], px[r, 0] - px[s, 0], px[r, 1] - px[s, 1]
+                        b2, c2 = bx * bx + by * by, cx * cx + cy * cy
+                        inside = ax * (by * c2 - b2 * cy) - ay * (bx * c2 - b2 * cx) + a2 * (bx * cy - by * cx)
+                        inside /= (a2 + b2 + c2) * (a2 + b2 + c2)
+                if abs(inside) < AMBIGUOUS or flips > MOST_FLIPS * len(triangles):
+                    return -1
+                if inside < 0:
+                    continue
+                flips += 1
+                after = j + 1 if j < 2 else 0
+                beside, opposite = beyond[t, second], beyond[u, after]  # beyond r p, and beyond q s
+                triangles[t, third], triangles[u, 3 - j - after] = s, p
+                beyond[t, first], beyond[u, j], beyond[t, second], beyond[u, after] = opposite, beside, u, t
+                for k in range(3):
+                    if beyond[opposite, k] == u:
+                        beyond[opposite, k] = t
+                    if beyond[beside, k] == t:
+                        beyond[beside, k] = u
+                due[t] = due[u] = changed = True
+                break
+    return flips
 
 
 class Polygons(Sequence[np.ndarray]):
@@ -206,109 +212,98 @@ def triangulate(nodes_px: np.ndarray) -> np.ndarray | None:
     return None if len(mesh.coplanar) else mesh.simplices
 
 
-@compiled()
-def polygon_area(polygon: np.ndarray, count: int) -> float:
-    """Signed area (shoelace) of the first ``count`` vertices, relative to the first vertex, which avoids cancellation of digits."""
-    total = 0.0
-    x0, y0 = polygon[0, 0], polygon[0, 1]
-    for k in range(1, count - 1):
-        total += (polygon[k, 0] - x0) * (polygon[k + 1, 1] - y0) - (polygon[k + 1, 0] - x0) * (polygon[k, 1] - y0)
-    return 0.5 * total
+@compiled(error_model="numpy")
+def _cut(
+    nodes: np.ndarray,
+    start: np.ndarray,
+    neighbours: np.ndarray,
+    outlines: np.ndarray,
+    disc: np.ndarray,
+    work: np.ndarray,
+    area: np.ndarray,
+    first: np.ndarray,
+    corners: np.ndarray,
+) -> None:
+    """Cut every cell out of the region: its area (n,), its corners in one array, and where they begin, (n + 1,).
 
-
-@compiled()
-def _clip_half_plane(polygon: np.ndarray, count: int, a: float, b: float, c: float, out: np.ndarray) -> int:
-    """The part of a polygon with a x + b y <= c (Sutherland and Hodgman 1974); returns its vertex count."""
-    kept = 0
-    px, py = polygon[count - 1, 0], polygon[count - 1, 1]
-    previous = a * px + b * py - c
-    for k in range(count):
-        x, y = polygon[k, 0], polygon[k, 1]
-        here = a * x + b * y - c
-        if (here <= 0) != (previous <= 0):
-            t = previous / (previous - here)
-            out[kept, 0] = px + t * (x - px)
-            out[kept, 1] = py + t * (y - py)
-            kept += 1
-        if here <= 0:
-            out[kept, 0] = x
-            out[kept, 1] = y
-            kept += 1
-        px, py, previous = x, y, here
-    return kept
-
-
-@compiled()
-def _cells(
-    nodes: np.ndarray, start: np.ndarray, neighbours: np.ndarray, region: np.ndarray, center: np.ndarray, radius: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Area of every cell, the vertices of all cells in one array, and where each cell's vertices begin.
-
-    Cutting starts from the region's bounding box, which has few vertices. The region contains a disc; only a cell that extends beyond it is
-    cut again, starting from the region itself.
+    Cutting (Sutherland and Hodgman 1974) starts from the region's bounding box, which has few corners: the first 4 of ``outlines``, before
+    those of the region. The region contains a ``disc``: x, y, radius. Only a cell that extends beyond it is cut again, starting from the
+    region itself. Corners that are too many for their array are only counted.
     """
-    n, m = len(nodes), len(region)
-    area, first = np.zeros(n), np.zeros(n + 1, np.int64)
-    store, here = np.empty((16 * n + 4 * m, 2)), np.empty((2 * m + 2 * n + 8, 2))
-    there = np.empty_like(here)
-    left, right, top, bottom = region[:, 0].min(), region[:, 0].max(), region[:, 1].min(), region[:, 1].max()
-    box = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
-    for i in range(n):
-        count = 0
-        for outline in (box, region):
-            count = len(outline)
+    for i in range(len(area)):
+        count, now, inside = 0, 0, False
+        for attempt in range(2):
+            count, now = 4 if attempt == 0 else len(outlines) - 4, 0
             for k in range(count):
-                here[k, 0], here[k, 1] = outline[k, 0], outline[k, 1]
+                work[0, k, 0], work[0, k, 1] = outlines[4 * attempt + k, 0], outlines[4 * attempt + k, 1]
             for e in range(start[i], start[i + 1]):
                 j = neighbours[e]
                 a, b = nodes[j, 0] - nodes[i, 0], nodes[j, 1] - nodes[i, 1]
                 c = 0.5 * (nodes[j, 0] ** 2 + nodes[j, 1] ** 2 - nodes[i, 0] ** 2 - nodes[i, 1] ** 2)
-                count = _clip_half_plane(here, count, a, b, c, there)
-                here, there = there, here
+                kept = 0
+                px, py = work[now, count - 1, 0], work[now, count - 1, 1]
+                previous = a * px + b * py - c
+                for k in range(count):
+                    x, y = work[now, k, 0], work[now, k, 1]
+                    here = a * x + b * y - c
+                    if (here <= 0) != (previous <= 0):
+                        t = previous / (previous - here)
+                        work[1 - now, kept, 0], work[1 - now, kept, 1] = px + t * (x - px), py + t * (y - py)
+                        kept += 1
+                    if here <= 0:
+                        work[1 - now, kept, 0], work[1 - now, kept, 1] = x, y
+                        kept += 1
+                    px, py, previous = x, y, here
+                count, now = kept, 1 - now
                 if count == 0:
                     break
             inside = count > 2
             for k in range(count):
-                inside = inside and (here[k, 0] - center[0]) ** 2 + (here[k, 1] - center[1]) ** 2 < radius**2
+                inside = inside and (work[now, k, 0] - disc[0]) ** 2 + (work[now, k, 1] - disc[1]) ** 2 < disc[2] ** 2
             if inside:
                 break
-        if count > 2:
-            area[i] = polygon_area(here, count)
-        while first[i] + count > len(store):
-            store = np.concatenate((store, np.empty_like(store)))
+        total = 0.0  # relative to the first corner, which avoids cancellation of digits
+        x, y = work[now, 0, 0], work[now, 0, 1]
+        for k in range(1, count - 1):
+            total += (work[now, k, 0] - x) * (work[now, k + 1, 1] - y) - (work[now, k + 1, 0] - x) * (work[now, k, 1] - y)
+        area[i] = 0.5 * total
         for k in range(count):
-            store[first[i] + k, 0], store[first[i] + k, 1] = here[k, 0], here[k, 1]
+            if first[i] + k < len(corners):
+                corners[first[i] + k, 0], corners[first[i] + k, 1] = work[now, k, 0], work[now, k, 1]
         first[i + 1] = first[i] + count
-    return area, store[: first[n]], first
 
 
 def _tile(nodes: np.ndarray, start: np.ndarray, neighbours: np.ndarray, region: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The result of `_cells`, for the largest disc about the region's middle."""
-    center = region.mean(axis=0)
-    radius = WITHIN * cv2.pointPolygonTest(region.astype(np.float32), center.tolist(), measureDist=True)
-    return _cells(nodes, start, neighbours, region, center, radius)
-
-
-@compiled()
-def _star_shaped(polygon: np.ndarray) -> bool:
-    """Whether a closed polygon about the origin winds around it once, always in the same direction."""
-    x, y = polygon[:, 0], polygon[:, 1]
-    x0, y0 = np.roll(x, 1), np.roll(y, 1)
-    cross = x0 * y - y0 * x
-    turn = np.arctan2(cross, x0 * x + y0 * y).sum()
-    return ((cross > 0).all() or (cross < 0).all()) and abs(abs(turn) - 2 * np.pi) < 1e-6
+    """Area (n,) of every cell, the corners of all cells in one array, and where each cell's corners begin (n + 1,)."""
+    n, m = len(nodes), len(region)
+    x, y = region.mean(axis=0).tolist()
+    radius = WITHIN * cv2.pointPolygonTest(region.astype(np.float32), (x, y), measureDist=True)
+    outlines = np.empty((m + 4, 2))
+    outlines[:4], outlines[4:] = region.min(axis=0), region
+    outlines[1:3, 0], outlines[2:4, 1] = region.max(axis=0)
+    area, first, corners = np.empty(n), np.zeros(n + 1, np.int64), np.empty((16 * n + 4 * m, 2))
+    disc, work = np.array([x, y, radius]), np.empty((2, 2 * m + 2 * n + 8, 2))
+    _cut(nodes, start, neighbours, outlines, disc, work, area, first, corners)
+    if first[n] > len(corners):
+        corners = np.empty((first[n], 2))
+        _cut(nodes, start, neighbours, outlines, disc, work, area, first, corners)
+    return area, corners[: first[n]], first
 
 
 def _outline_region(nodes: np.ndarray, outmost: np.ndarray | None) -> np.ndarray | None:
-    """The outmost nodes' polygon, enlarged and counter-clockwise (y up); None if it is not usable."""
+    """The outmost nodes' polygon, enlarged and counter-clockwise (y up); None if it is not star-shaped about its middle."""
     if outmost is None or len(outmost) < 3:
         return None
     polygon = nodes[outmost]
     center = polygon.mean(axis=0)
-    if not _star_shaped(polygon - center):
+    around = polygon - center
+    (x, y), (x0, y0) = around.T, np.concatenate([around[-1:], around[:-1]]).T
+    across = x0 * y - y0 * x
+    turn = np.arctan2(across, x0 * x + y0 * y).sum()
+    if across.min() * across.max() <= 0 or abs(abs(turn) - 2 * np.pi) > 1e-6:
         return None
-    region = center + BOUNDARY_SCALE * (polygon - center)
-    return region if polygon_area(region, len(region)) > 0 else np.ascontiguousarray(region[::-1])
+    region = center + BOUNDARY_SCALE * around
+    return region if turn > 0 else region[::-1]
 
 
 def _hull_region(nodes: np.ndarray) -> np.ndarray:
@@ -319,13 +314,13 @@ def _hull_region(nodes: np.ndarray) -> np.ndarray:
     if len(nodes) >= 3 and size[-1] > 1e-9 * max(size[0], 1.0):
         hull = nodes[ConvexHull(nodes).vertices]
         middle = hull.mean(axis=0)
-        return np.ascontiguousarray(middle + BOUNDARY_SCALE * (hull - middle))
+        return middle + BOUNDARY_SCALE * (hull - middle)
     along = spread @ axes[0]
     margin = max(STRIP_SHARE * np.ptp(along), LEAST_STRIP_PX) / 2
     low, high = along.min() - margin, along.max() + margin
     corners = np.array([[low, -margin], [high, -margin], [high, margin], [low, margin]])
     region = center + corners @ axes
-    return region if polygon_area(region, 4) > 0 else np.ascontiguousarray(region[::-1])
+    return region if np.linalg.det(axes) > 0 else region[::-1]
 
 
 def voronoi(nodes_px: np.ndarray, *, outmost: np.ndarray | None = None, edges: np.ndarray | None = None) -> Tessellation:

@@ -147,15 +147,14 @@ def _smooth_window(gray: np.ndarray, disc: np.ndarray) -> np.ndarray:
 
 @compiled()
 def _measure_components(
-    gray: np.ndarray, grown: np.ndarray, ringed: np.ndarray, bright: np.ndarray, boxes: np.ndarray, reach: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Bright pixels, weight and elongation (count, 3) of each component, and its weighted centre (count, 2).
+    gray: np.ndarray, grown: np.ndarray, ringed: np.ndarray, bright: np.ndarray, boxes: np.ndarray, reach: int, measures: np.ndarray
+) -> None:
+    """Bright pixels, weight, elongation and weighted centre (count, 5) of each component, from zeros.
 
     A pixel's weight is its level above the mean of the ring around its component; negative weights are left out. A component's pixels in
     ``grown`` lie within ``reach`` of its box. Its ring is where ``ringed`` has it and ``grown`` has nothing, ``RING_PX`` farther.
     """
     height, width = gray.shape
-    sizes, middle = np.zeros((len(boxes), 3)), np.zeros((len(boxes), 2))
     for k in range(1, len(boxes)):
         left, right = boxes[k, 0] - reach, boxes[k, 0] + boxes[k, 2] + reach
         top, bottom = boxes[k, 1] - reach, boxes[k, 1] + boxes[k, 3] + reach
@@ -179,14 +178,13 @@ def _measure_components(
                         mxx += weight * x * x
                         mxy += weight * x * y
                         myy += weight * y * y
-        sizes[k, 0] = size
+        measures[k, 0] = size
         if m > 0:
             cx, cy = mx / m, my / m
             xx, xy, yy = mxx / m - cx * cx, mxy / m - cx * cy, myy / m - cy * cy
             root = np.hypot(xx - yy, 2 * xy)
-            sizes[k, 1], sizes[k, 2] = m, (xx + yy + root) / max(xx + yy - root, 1e-3)
-            middle[k, 0], middle[k, 1] = cx, cy
-    return sizes, middle
+            measures[k, 1], measures[k, 2] = m, (xx + yy + root) / max(xx + yy - root, 1e-3)
+            measures[k, 3], measures[k, 4] = cx, cy
 
 
 def find_blobs(gray: np.ndarray, mask: Mask, blob: BlobSpec, *, max_area_px2: float) -> Blobs:
@@ -208,11 +206,12 @@ def find_blobs(gray: np.ndarray, mask: Mask, blob: BlobSpec, *, max_area_px2: fl
     grow = 2 * blob.erosion_px + 1
     grown = cv2.copyTo(labels, eroded, cv2.dilate(labels, np.ones((grow, grow), np.uint8)))
     ringed = cv2.dilate(labels, np.ones((grow + 2 * RING_PX, grow + 2 * RING_PX), np.uint8))
-    sizes, middle = _measure_components(gray, grown, ringed, bright, boxes, blob.erosion_px)
-    area, weight, elongation = sizes.T
+    measures = np.zeros((len(boxes), 5))
+    _measure_components(gray, grown, ringed, bright, boxes, blob.erosion_px, measures)
+    area, weight, elongation = measures[:, :3].T
     whole = boxes[:, 4] >= LEAST_FILL * boxes[:, 2] * boxes[:, 3]
     keep = np.flatnonzero((area >= blob.min_area_px2) & (area <= max_area_px2) & (weight > 0) & whole)
-    return Blobs(middle[keep] + mask.corner_px, area[keep], elongation[keep], keep, area, boxes[:, :4], grown, gray, mask.corner_px)
+    return Blobs(measures[keep, 3:] + mask.corner_px, area[keep], elongation[keep], keep, area, boxes[:, :4], grown, gray, mask.corner_px)
 
 
 def find_spots(gray: np.ndarray, mask: Mask, blob: BlobSpec) -> Blobs:

@@ -106,30 +106,46 @@ MOST_LEFT = 0.03
 MOST_MISFIT = 0.15
 """Largest rms distance, in spacings, from the places of the coherent motion to the blobs. Deep contacts of two recordings have
 at most 0.13, a torn picture 0.18."""
-Buckets = tuple[np.ndarray, np.ndarray, float, float, int, int]
-"""First blob of each cell, next blob in the same cell, x0, y0, columns, rows."""
 
 
 class LayoutArrays(NamedTuple):
     """The reference's arrays that matching needs: rest (N, 2) px, neighbours (N, k), spacing (N,) px, slots (S,), ring_ends (R + 1,).
 
+    ``beside`` (N, k, 3) are the neighbours' x and y from the pin, in its spacings, and their weights 1 / (0.5 + x^2 + y^2).
     Ring i's pins are ``slots[ring_ends[i - 1]:ring_ends[i]]``, in order around the layout, -1 where one is missing.
     """
 
     rest: np.ndarray
     neighbours: np.ndarray
+    beside: np.ndarray
     spacing: np.ndarray
     slots: np.ndarray
     ring_ends: np.ndarray
 
 
 class FrameBlobs(NamedTuple):
-    """Blobs of a frame: places (K, 2) px, areas (K,), the cells in which they are looked up, and the side of a cell, px."""
+    """Blobs of a frame in square cells, in which they are looked up.
+
+    Attributes
+    ----------
+    px : (K, 2) float
+    area : (K,) float
+    order, first : (K,), (C + 1,) int
+        The blobs' numbers by rows of cells, and where each cell's numbers begin.
+    left, top, cell : float
+        The corner of the first cell, and a cell's side, px.
+    columns : int
+        Cells in a row.
+    """
 
     px: np.ndarray
     area: np.ndarray
-    buckets: Buckets
+    order: np.ndarray
+    first: np.ndarray
+    left: float
+    top: float
     cell: float
+    columns: int
 
 
 @dataclass(frozen=True)
@@ -202,17 +218,15 @@ def find_again(reference: Reference, px: np.ndarray, area_px2: np.ndarray, befor
     return replace(_refine(layout, blobs, _grow(layout, blobs, names)), lead=before.lead)
 
 
-@compiled()
 def _carry_names(layout: LayoutArrays, before_px: np.ndarray, blobs: FrameBlobs) -> np.ndarray:
     """Blob (N,) next to each pin's place (N, 2) before, NaN where it was lost; -1 for a pin that has none of its own."""
-    found, taken, none = np.full(len(before_px), -1), np.zeros(len(blobs.px), np.bool_), np.zeros(len(blobs.px), np.bool_)
-    for i in range(len(before_px)):
-        if np.isnan(before_px[i, 0]):
-            continue
-        reach = FOLLOW_GATE * layout.spacing[i]
-        k, _ = nearest_free(before_px[i, 0], before_px[i, 1], reach, blobs.px, none, blobs.buckets, blobs.cell)
-        if k >= 0 and not taken[k]:
-            found[i], taken[k] = k, True
+    pins, near, away2 = _pairs(before_px, FOLLOW_GATE * layout.spacing, blobs)
+    found, owner = np.full(len(before_px), -1), np.full(len(blobs.px), -1)
+    farthest = np.argsort(-away2)
+    found[pins[farthest]] = near[farthest]  # the last, nearest one counts
+    last = np.flatnonzero(found >= 0)[::-1]
+    owner[found[last]] = last
+    found[last[owner[found[last]] != last]] = -1
     return found
 
 
@@ -416,8 +430,10 @@ def complete(reference: Reference, pins_px: np.ndarray) -> np.ndarray:
     return nodes_px
 
 
-@compiled()
-def predict(i: int, layout: LayoutArrays, moved: np.ndarray, weight: np.ndarray) -> tuple[float, float, int]:
+@compiled(error_model="numpy")
+def predict(
+    i: int, rest: np.ndarray, neighbours: np.ndarray, beside: np.ndarray, moved: np.ndarray, weight: np.ndarray
+) -> tuple[float, float, int]:
     """Displacement of pin ``i`` as predicted from its neighbours alone, and the number of neighbours that were used.
 
     u(x) = a + G (x - x_i) is fitted by weighted least squares to the neighbours with ``weight`` > 0. A small penalty of the gradient G
@@ -426,7 +442,8 @@ def predict(i: int, layout: LayoutArrays, moved: np.ndarray, weight: np.ndarray)
     Parameters
     ----------
     i : int
-    layout : LayoutArrays
+    rest, neighbours, beside : array
+        See ``LayoutArrays``.
     moved : (N, 2) float
         Current positions, px.
     weight : (N,) float
@@ -438,8 +455,6 @@ def predict(i: int, layout: LayoutArrays, moved: np.ndarray, weight: np.ndarray)
         Displacement, px.
     count : int
     """
-    rest, neighbours, spacing = layout.rest, layout.neighbours, layout.spacing
-    s2 = spacing[i] * spacing[i]
     m00 = m01 = m02 = 0.0
     m11 = m22 = RIDGE
     m12 = 0.0
@@ -450,9 +465,7 @@ def predict(i: int, layout: LayoutArrays, moved: np.ndarray, weight: np.ndarray)
         if weight[j] <= 0:
             continue
         count += 1
-        x = (rest[j, 0] - rest[i, 0]) / spacing[i]
-        y = (rest[j, 1] - rest[i, 1]) / spacing[i]
-        w = weight[j] / (0.5 + (x * x + y * y))
+        x, y, w = beside[i, k, 0], beside[i, k, 1], weight[j] * beside[i, k, 2]
         ux, uy = moved[j, 0] - rest[j, 0], moved[j, 1] - rest[j, 1]
         m00 += w
         m01 += w * x
@@ -466,7 +479,7 @@ def predict(i: int, layout: LayoutArrays, moved: np.ndarray, weight: np.ndarray)
         by0 += w * uy
         by1 += w * uy * x
         by2 += w * uy * y
-    if count == 0 or s2 == 0:
+    if count == 0:
         return 0.0, 0.0, 0
     c00 = m11 * m22 - m12 * m12
     c01 = m02 * m12 - m01 * m22
@@ -475,122 +488,138 @@ def predict(i: int, layout: LayoutArrays, moved: np.ndarray, weight: np.ndarray)
     return (c00 * bx0 + c01 * bx1 + c02 * bx2) / det, (c00 * by0 + c01 * by1 + c02 * by2) / det, count
 
 
-@compiled()
 def predict_all(layout: LayoutArrays, moved: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Each pin's position (N, 2) as predicted from its neighbours; NaN if no neighbour has a weight."""
-    rest = layout.rest
-    out = np.empty_like(rest)
-    for i in range(len(rest)):
-        ux, uy, count = predict(i, layout, moved, weight)
-        out[i, 0] = rest[i, 0] + ux if count else np.nan
-        out[i, 1] = rest[i, 1] + uy if count else np.nan
+    out = np.empty_like(moved)
+    _predict_each(layout.rest, layout.neighbours, layout.beside, moved, weight, out)
     return out
 
 
-@compiled()
+@compiled(error_model="numpy")
+def _predict_each(
+    rest: np.ndarray, neighbours: np.ndarray, beside: np.ndarray, moved: np.ndarray, weight: np.ndarray, out: np.ndarray
+) -> None:
+    for i in range(len(rest)):
+        ux, uy, count = predict(i, rest, neighbours, beside, moved, weight)
+        out[i, 0] = rest[i, 0] + ux if count else np.nan
+        out[i, 1] = rest[i, 1] + uy if count else np.nan
+
+
 def _grow(layout: LayoutArrays, blobs: FrameBlobs, start: np.ndarray) -> np.ndarray:
     """Grow a labelling (N,) from ``start`` (N,), which has at least one pair. Each round labels pins next to labelled ones."""
-    rest, neighbours, spacing, px = layout.rest, layout.neighbours, layout.spacing, blobs.px
-    n = len(rest)
-    blob = start.copy()
-    moved, weight = px[blob], (blob >= 0).astype(np.float64)
-    taken = np.zeros(len(px), np.bool_)
-    near = min(6, neighbours.shape[1])
-    labelled = 0
-    for i in range(n):
-        if blob[i] >= 0:
-            taken[blob[i]] = True
-            labelled += 1
-    claim = np.full(len(px), -1)
-    claim_cost = np.zeros(len(px))
-    tried = np.full(n, -1)  # number of labelled neighbours when a pin was last tried
-    for level in range(len(GROW_GATES)):
-        tried[:] = -1
-        least = 3 if level == 0 else 2
-        growing = True
-        while growing:
-            growing = False
-            claim[:] = -1
-            for i in range(n):
-                if blob[i] >= 0:
-                    continue
-                touching = 0
-                for k in range(near):
-                    touching += blob[neighbours[i, k]] >= 0
-                if touching == 0:
-                    continue
-                ux, uy, count = predict(i, layout, moved, weight)
-                if count == tried[i] or count < min(least, labelled):
-                    continue
-                tried[i] = count
-                x, y = rest[i, 0] + ux, rest[i, 1] + uy
-                k, d2 = nearest_free(x, y, GROW_GATES[level] * spacing[i], px, taken, blobs.buckets, blobs.cell)
-                if k >= 0:
-                    cost = d2 / (spacing[i] * spacing[i])
-                    if claim[k] < 0 or cost < claim_cost[k]:
-                        claim[k] = i
-                        claim_cost[k] = cost
-            for k in range(len(px)):
-                i = claim[k]
-                if i >= 0:
-                    blob[i] = k
-                    moved[i, 0], moved[i, 1] = px[k, 0], px[k, 1]
-                    weight[i] = 1.0
-                    taken[k] = True
-                    labelled += 1
-                    growing = True
+    blob, count = start.copy(), len(blobs.px)
+    moved, weight, taken = blobs.px[blob], (blob >= 0).astype(float), np.zeros(count, bool)
+    taken[blob[blob >= 0]] = True
+    numbers = np.empty((2, count), int)
+    known = layout.rest, layout.neighbours, layout.beside, layout.spacing
+    _grow_onward(*known, blobs, blob, moved, weight, taken, numbers, np.empty((2, count)), np.empty(len(blob), int))
     return blob
 
 
-@compiled()
-def _ring_turns(layout: LayoutArrays, px: np.ndarray, blob: np.ndarray, winding: int) -> tuple[np.ndarray, int]:
-    """Turn of each ring (R,) as a unit complex number (0: unknown) after its labels are shifted back by ``winding``; number known."""
-    rest, slots, ring_ends = layout.rest, layout.slots, layout.ring_ends
-    turns = np.zeros(len(ring_ends) - 1, np.complex128)
-    known = 0
-    for ring in range(len(turns)):
-        first, size = ring_ends[ring], ring_ends[ring + 1] - ring_ends[ring]
-        count = 0
-        at, to, product = 0j, 0j, 0j
-        for k in range(size):
-            pin, source = slots[first + k], slots[first + (k - winding) % size]
-            j = blob[source] if pin >= 0 and source >= 0 else -1
-            if j >= 0:
-                a = complex(rest[pin, 0], rest[pin, 1])
-                b = complex(px[j, 0], px[j, 1])
-                at += a
-                to += b
-                product += a.conjugate() * b
-                count += 1
-        if count > 2:
-            turn = product - at.conjugate() * to / count
-            if abs(turn) > 0:
-                turns[ring] = turn / abs(turn)
-                known += 1
-    return turns, known
+@compiled(error_model="numpy")
+def _grow_onward(
+    rest: np.ndarray,
+    neighbours: np.ndarray,
+    beside: np.ndarray,
+    spacing: np.ndarray,
+    blobs: FrameBlobs,
+    blob: np.ndarray,
+    moved: np.ndarray,
+    weight: np.ndarray,
+    taken: np.ndarray,
+    numbers: np.ndarray,
+    squares: np.ndarray,
+    tried: np.ndarray,
+) -> None:
+    """Grow a labelling (N,), with the positions (N, 2) and weights (N,) of its pairs and the blobs (K,) ``taken`` by them.
+
+    ``numbers`` and ``squares`` (2, K) are for work, and so is ``tried`` (N,): number of labelled neighbours when a pin was last tried.
+    """
+    near = min(6, neighbours.shape[1])
+    claim, found = numbers[0], numbers[1]
+    claim_cost, away2 = squares[0], squares[1]
+    labelled = 0
+    for i in range(len(blob)):
+        labelled += blob[i] >= 0
+    for level in range(len(GROW_GATES)):
+        for i in range(len(blob)):
+            tried[i] = -1
+        growing = True
+        while growing:
+            growing = False
+            for k in range(len(claim)):
+                claim[k] = -1
+            for i in range(len(blob)):
+                touching = False
+                for k in range(near):
+                    touching = touching or blob[neighbours[i, k]] >= 0
+                if blob[i] >= 0 or not touching:
+                    continue
+                ux, uy, count = predict(i, rest, neighbours, beside, moved, weight)
+                if count == tried[i] or count < min(3 - level, labelled):
+                    continue
+                tried[i] = count
+                x, y = rest[i, 0] + ux, rest[i, 1] + uy
+                best, best_d2 = -1, np.inf
+                for at in range(find_near(x, y, GROW_GATES[level] * spacing[i], blobs, found, away2)):
+                    if away2[at] < best_d2 and not taken[found[at]]:
+                        best, best_d2 = found[at], away2[at]
+                cost = best_d2 / (spacing[i] * spacing[i])
+                if best >= 0 and (claim[best] < 0 or cost < claim_cost[best]):
+                    claim[best], claim_cost[best] = i, cost
+            for k in range(len(claim)):
+                i = claim[k]
+                if i >= 0:
+                    blob[i], weight[i], taken[k] = k, 1.0, True
+                    moved[i, 0], moved[i, 1] = blobs.px[k, 0], blobs.px[k, 1]
+                    labelled += 1
+                    growing = True
 
 
-@compiled()
+@compiled(error_model="numpy")
+def _turn_rings(
+    rest: np.ndarray, slots: np.ndarray, ring_ends: np.ndarray, px: np.ndarray, blob: np.ndarray, least: int, turns: np.ndarray
+) -> None:
+    """Turn of each ring as a unit vector, 0 if unknown, after its labels are shifted back by ``least`` or more pins: (W, R, 2)."""
+    for w in range(len(turns)):
+        for ring in range(len(ring_ends) - 1):
+            first, size = ring_ends[ring], ring_ends[ring + 1] - ring_ends[ring]
+            count, ax, ay, bx, by, along, across = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for k in range(size):
+                pin, source = slots[first + k], slots[first + (k - least - w) % size]
+                j = blob[source] if pin >= 0 and source >= 0 else -1
+                if j >= 0:
+                    count += 1
+                    ax, ay, bx, by = ax + rest[pin, 0], ay + rest[pin, 1], bx + px[j, 0], by + px[j, 1]
+                    along += rest[pin, 0] * px[j, 0] + rest[pin, 1] * px[j, 1]
+                    across += rest[pin, 0] * px[j, 1] - rest[pin, 1] * px[j, 0]
+            if count > 2:
+                along, across = along - (ax * bx + ay * by) / count, across - (ax * by - ay * bx) / count
+                length = np.sqrt(along * along + across * across)
+                if length > 0:
+                    turns[w, ring, 0], turns[w, ring, 1] = along / length, across / length
+
+
+def _ring_turns(layout: LayoutArrays, px: np.ndarray, blob: np.ndarray, most: int) -> np.ndarray:
+    """Turns (2 most + 1, R) of the rings as unit complex numbers, 0 if unknown, after their labels are shifted by up to ``most`` pins."""
+    turns = np.zeros((2 * most + 1, len(layout.ring_ends) - 1, 2))
+    _turn_rings(layout.rest, layout.slots, layout.ring_ends, px, blob, -most, turns)
+    return turns.view(complex)[..., 0]
+
+
 def _unwound(layout: LayoutArrays, px: np.ndarray, blob: np.ndarray) -> np.ndarray:
     """A labelling (N,) whose rings are shifted back by the number of pins with which they turn most alike.
 
     If anything is shifted, the innermost rings lose their labels.
     """
-    slots, ring_ends = layout.slots, layout.ring_ends
-    best, most_alike = 0, abs(_ring_turns(layout, px, blob, 0)[0][BROKEN_RINGS:].sum())
-    for winding in range(-MAX_WINDING, MAX_WINDING + 1):
-        alike = abs(_ring_turns(layout, px, blob, winding)[0][BROKEN_RINGS:].sum())
-        if alike > most_alike:
-            best, most_alike = winding, alike
-    if best == 0:
+    alike = np.abs(_ring_turns(layout, px, blob, MAX_WINDING)[:, BROKEN_RINGS:].sum(axis=1))
+    if alike[MAX_WINDING] == alike.max():
         return blob
-    out = np.full_like(blob, -1)
-    for ring in range(BROKEN_RINGS, len(ring_ends) - 1):
-        first, size = ring_ends[ring], ring_ends[ring + 1] - ring_ends[ring]
-        for k in range(size):
-            pin, source = slots[first + k], slots[first + (k - best) % size]
-            if pin >= 0 and source >= 0:
-                out[pin] = blob[source]
+    out = np.full(len(blob), -1)
+    for ring in np.split(layout.slots, layout.ring_ends[1:-1])[BROKEN_RINGS:]:
+        source = np.roll(ring, alike.argmax() - MAX_WINDING)
+        both = (ring >= 0) & (source >= 0)
+        out[ring[both]] = blob[source[both]]
     return out
 
 
@@ -601,33 +630,41 @@ def _trust(layout: LayoutArrays, px: np.ndarray, blob: np.ndarray) -> tuple[np.n
     return moved, np.fmax(weight / (1 + away2 / (SOFT_RESIDUAL * layout.spacing) ** 2), 0.0)  # 0 without a prediction
 
 
-@compiled()
 def _candidates(
-    layout: LayoutArrays, of_frame: FrameBlobs, predicted: np.ndarray, blob: np.ndarray
+    layout: LayoutArrays, blobs: FrameBlobs, predicted: np.ndarray, blob: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Possible pairs within the gate: pins, blobs and costs (p,)."""
-    neighbours, spacing, px, area = layout.neighbours, layout.spacing, of_frame.px, of_frame.area
-    # numba needs lists of a known type, also empty ones
-    pins: list[int] = [0 for _ in range(0)]
-    blobs: list[int] = [0 for _ in range(0)]
-    costs: list[float] = [0.0 for _ in range(0)]
-    for i in range(len(predicted)):
-        x, y = predicted[i, 0], predicted[i, 1]
-        if not np.isfinite(x + y):
-            continue
-        total, count = 0.0, 0
-        for k in range(neighbours.shape[1]):
-            j = blob[neighbours[i, k]]
-            if j >= 0:
-                total += area[j]
-                count += 1
-        expected = total / max(count, 1)
-        for k, d2 in blobs_near(x, y, FINAL_GATE * spacing[i], px, of_frame.buckets, of_frame.cell):
-            if area[k] >= MIN_AREA_RATIO * expected:
-                pins.append(i)
-                blobs.append(k)
-                costs.append(d2 / (spacing[i] * spacing[i]) + AREA_LOG_WEIGHT * np.log(area[k] / expected) ** 2)
-    return np.array(pins), np.array(blobs), np.array(costs)
+    pins, near, away2 = _pairs(predicted, FINAL_GATE * layout.spacing, blobs)
+    known, each = (blob >= 0).astype(float), np.ones(layout.neighbours.shape[1])
+    around = (known * blobs.area[blob]).take(layout.neighbours) @ each / np.maximum(known.take(layout.neighbours) @ each, 1)
+    area, expected = blobs.area[near], around[pins]
+    whole = area >= MIN_AREA_RATIO * expected
+    if not whole.all():
+        pins, near, away2, area, expected = (one[whole] for one in (pins, near, away2, area, expected))
+    return pins, near, away2 / layout.spacing[pins] ** 2 + AREA_LOG_WEIGHT * np.log(area / expected) ** 2
+
+
+def _pairs(places: np.ndarray, reach: np.ndarray, blobs: FrameBlobs) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places (N, 2) and blobs nearer to them than their ``reach`` (N,): numbers of both, and squared distances (p,)."""
+    room = 2 * len(places)
+    while True:
+        pins, near, away2 = np.empty(room, int), np.empty(room, int), np.empty(room)
+        count = _pair_near(places, reach, blobs, pins, near, away2)
+        if count <= room:
+            return pins[:count], near[:count], away2[:count]
+        room = count
+
+
+@compiled(error_model="numpy")
+def _pair_near(places: np.ndarray, reach: np.ndarray, blobs: FrameBlobs, pins: np.ndarray, near: np.ndarray, away2: np.ndarray) -> int:
+    """As `_pairs`, into arrays; returns the number of pairs. Those that are too many for the arrays are only counted."""
+    count = 0
+    for i in range(len(places)):
+        before = count
+        count += find_near(places[i, 0], places[i, 1], reach[i], blobs, near[before:], away2[before:])
+        for at in range(before, min(count, len(pins))):
+            pins[at] = i
+    return count
 
 
 def _assign(n: int, blob_count: int, pins: np.ndarray, blobs: np.ndarray, costs: np.ndarray) -> np.ndarray:
@@ -659,8 +696,8 @@ def _refine(layout: LayoutArrays, blobs: FrameBlobs, blob: np.ndarray) -> Match:
     blob = _adopt(layout, px, blobs.area, blob, predicted)
     found = blob >= 0
     residual2 = ((px[blob[found]] - predicted[found]) ** 2).sum(axis=1) / (FINAL_GATE * layout.spacing[found]) ** 2
-    turns, count = _ring_turns(layout, px, blob, 0)
-    turned = 1.0 - turns.real.sum() / max(count, 1)
+    turns = _ring_turns(layout, px, blob, 0)[0]
+    turned = 1.0 - turns.real.sum() / max(np.count_nonzero(turns), 1)
     return Match(blob, predicted, float(found.sum() - residual2.sum() - TURN_WEIGHT * len(blob) * turned))
 
 
@@ -711,48 +748,37 @@ def _seeds(reference: Reference, px: np.ndarray) -> Iterator[tuple[int, int]]:
 
 
 def _layout(reference: Reference) -> LayoutArrays:
-    return LayoutArrays(reference.pins_px, reference.neighbours, reference.spacing_px, reference.slots, reference.ring_ends)
+    known = reference
+    return LayoutArrays(known.pins_px, known.neighbours, known.beside, known.spacing_px, known.slots, known.ring_ends)
 
 
 def _put_in_cells(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> FrameBlobs:
     px, cell = np.ascontiguousarray(px), reference.pitch_px
-    return FrameBlobs(px, area_px2, fill_buckets(px, cell), cell)
+    left, top = float(px[:, 0].min()), float(px[:, 1].min())
+    columns, rows = ((px[:, 0] - left) / cell).astype(int), ((px[:, 1] - top) / cell).astype(int)
+    width = int(columns.max()) + 1
+    cells = rows * width + columns
+    first = np.bincount(cells + 1, minlength=(int(rows.max()) + 1) * width + 1).cumsum()
+    return FrameBlobs(px, area_px2, cells.argsort(), first, left, top, cell, width)
 
 
-@compiled()
-def fill_buckets(px: np.ndarray, cell: float) -> Buckets:
-    """Put blobs (K, 2) into square cells with the side ``cell``, px."""
-    x0, y0 = px[:, 0].min(), px[:, 1].min()
-    columns = int((px[:, 0].max() - x0) / cell) + 1
-    rows = int((px[:, 1].max() - y0) / cell) + 1
-    head = np.full(columns * rows, -1)
-    following = np.full(len(px), -1)
-    for k in range(len(px)):
-        c = int((px[k, 1] - y0) / cell) * columns + int((px[k, 0] - x0) / cell)
-        following[k] = head[c]
-        head[c] = k
-    return head, following, x0, y0, columns, rows
+@compiled(error_model="numpy")
+def find_near(x: float, y: float, reach: float, blobs: FrameBlobs, found: np.ndarray, away2: np.ndarray) -> int:
+    """Put blobs nearer than ``reach`` to (x, y), and their squared distances, into arrays; returns their number.
 
-
-@compiled()
-def blobs_near(x: float, y: float, reach: float, px: np.ndarray, buckets: Buckets, cell: float) -> Iterator[tuple[int, float]]:
-    """Blobs within ``reach`` of (x, y): index and squared distance of each."""
-    head, following, x0, y0, columns, rows = buckets
-    for cy in range(max(int((y - reach - y0) / cell), 0), min(int((y + reach - y0) / cell), rows - 1) + 1):
-        for cx in range(max(int((x - reach - x0) / cell), 0), min(int((x + reach - x0) / cell), columns - 1) + 1):
-            k = head[cy * columns + cx]
-            while k >= 0:
-                d2 = (px[k, 0] - x) ** 2 + (px[k, 1] - y) ** 2
-                if d2 < reach * reach:
-                    yield k, d2
-                k = following[k]
-
-
-@compiled()
-def nearest_free(x: float, y: float, reach: float, px: np.ndarray, taken: np.ndarray, buckets: Buckets, cell: float) -> tuple[int, float]:
-    """Nearest free blob within ``reach`` of (x, y): (index or -1, squared distance)."""
-    best, best_d2 = -1, reach * reach
-    for k, d2 in blobs_near(x, y, reach, px, buckets, cell):
-        if d2 < best_d2 and not taken[k]:
-            best, best_d2 = k, d2
-    return best, best_d2
+    Those that are too many for the arrays are only counted. None is near to NaN.
+    """
+    columns, cell, count = blobs.columns, blobs.cell, 0
+    if not np.isfinite(x + y):
+        return count
+    low, high = max(int((x - reach - blobs.left) / cell), 0), min(int((x + reach - blobs.left) / cell), columns - 1)
+    last = min(int((y + reach - blobs.top) / cell), (len(blobs.first) - 1) // columns - 1)
+    for row in range(max(int((y - reach - blobs.top) / cell), 0), last + 1 if low <= high else 0):
+        for at in range(blobs.first[row * columns + low], blobs.first[row * columns + high + 1]):
+            k = blobs.order[at]
+            d2 = (blobs.px[k, 0] - x) ** 2 + (blobs.px[k, 1] - y) ** 2
+            if d2 < reach * reach:
+                if count < len(found):
+                    found[count], away2[count] = k, d2
+                count += 1
+    return count

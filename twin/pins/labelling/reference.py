@@ -16,12 +16,11 @@ from scipy.spatial import Delaunay, cKDTree
 from scenes.pins import PinsSpec
 from scenes.sensor import SensorSpec
 from twin.camera.projection import project_in_form
-from twin.compiled import compiled
 from twin.errors import FrameError
 from twin.frames.forms import form_named
 from twin.geometry.drift import coherent_motions
 from twin.geometry.pins import namings, pin_lattice, rest_pins
-from twin.pins.voronoi import Net, double_area, net_of, voronoi
+from twin.pins.voronoi import Net, net_of, voronoi
 from twin.types import Form
 
 # Number of neighbours of a pin: two rings of a triangular lattice. They are enough for a local affine fit without the pin itself.
@@ -99,6 +98,17 @@ class Reference:
         return float(np.median(self.spacing_px))
 
     @cached_property
+    def beside(self) -> np.ndarray:
+        """Places (N, k, 3) of the neighbours relative to each pin, in its spacings, and their weights 1 / (0.5 + x^2 + y^2)."""
+        away = (self.pins_px[self.neighbours] - self.pins_px[:, None]) / self.spacing_px[:, None, None]
+        return np.concatenate([away, 1 / (0.5 + (away**2).sum(axis=2, keepdims=True))], axis=2)
+
+    @cached_property
+    def rim_radius_px(self) -> float:
+        """Mean distance of the outmost pins from their mean."""
+        return mean_radius(self.pins_px[self.outmost])
+
+    @cached_property
     def starts(self) -> list[int]:
         """Pins from which labellings start: around the rim, where motion is least, then inside."""
         rim = self.outmost
@@ -119,11 +129,11 @@ class Reference:
 
     def rim_scale(self, px: np.ndarray) -> float:
         """Mean distance of the outmost pins from their mean when the pins move to ``px`` (N, 2), relative to that at rest."""
-        return mean_radius(px[self.outmost]) / mean_radius(self.pins_px[self.outmost])
+        return mean_radius(px[self.outmost]) / self.rim_radius_px
 
     def folded_fraction(self, px: np.ndarray) -> float:
         """Share of the triangles whose orientation is reversed when the pins move to ``px`` (N, 2)."""
-        over: int = count_turned_over(px, self.triangles, np.ones(len(px), bool))
+        over = np.count_nonzero(_areas2(px, self.triangles) <= 0)
         return over / max(len(self.triangles), 1)  # a small layout has outmost pins alone, and no triangles
 
     def motions(self, width: float) -> np.ndarray:
@@ -143,10 +153,10 @@ def mean_radius(px: np.ndarray) -> float:
     return float(np.linalg.norm(px - px.mean(axis=0), axis=1).mean())
 
 
-@compiled()
 def median_px(px: np.ndarray) -> np.ndarray:
-    """Medians (2,) of points (n, 2)."""
-    return np.array([np.median(px[:, 0]), np.median(px[:, 1])])
+    """Medians (2,) of finite points (n, 2): as ``np.median``, in a fifth of its time."""
+    ordered = np.sort(px, axis=0)
+    return (ordered[(len(px) - 1) // 2] + ordered[len(px) // 2]) / 2
 
 
 def spread_out(pins_px: np.ndarray) -> bool:
@@ -213,21 +223,24 @@ def project_rest(spec: SensorSpec, form: Form) -> np.ndarray:
 
 def _turned_alike(px: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Triangles (t, 3) over points (N, 2), turned over where their area is negative."""
-    (ax, ay), (bx, by), (cx, cy) = px[triangles].transpose(1, 2, 0)
-    negative = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax) < 0
-    return np.where(negative[:, None], triangles[:, ::-1], triangles)
+    return np.where(_areas2(px, triangles)[:, None] < 0, triangles[:, ::-1], triangles)
 
 
-@compiled()
+def _areas2(px: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Twice the signed areas (t,) of triangles (t, 3) over points (N, 2)."""
+    (ax, bx, cx), (ay, by, cy) = px[:, 0].take(triangles).T, px[:, 1].take(triangles).T
+    areas: np.ndarray = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+    return areas
+
+
 def count_turned_over(px: np.ndarray, triangles: np.ndarray, known: np.ndarray) -> int:
     """Number of triangles (t, 3) of pins whose orientation is reversed when the pins move to ``px`` (N, 2).
 
     Only those count whose three pins are ``known`` (N,) bool.
     """
-    count = 0
-    for a, b, c in triangles:
-        count += known[a] and known[b] and known[c] and double_area(px, a, b, c) <= 0
-    return count
+    if not known.all():
+        triangles = triangles[known[triangles].all(axis=1)]
+    return np.count_nonzero(_areas2(px, triangles) <= 0)
 
 
 def smooth_view(places: np.ndarray, px: np.ndarray) -> np.ndarray:

@@ -166,78 +166,73 @@ def contact_forces(
         A value below 1 gives softened contact, as an intermediate problem on the way to the solution. The penalty is multiplied by it,
         ``SMOOTH_GAP_MM`` and ``STICK_CREEP_MM`` are divided by it.
     """
-    probe = field.probe(at)
-    return ContactForces(probe[1], *_law(at, probe, soften * stiff, anchor, friction, bound, soften))
+    probe, count = field.probe(at), len(at)
+    force, pressing, depth, slipping = np.zeros((count, 3)), np.zeros(count), np.zeros(count), np.zeros(count, bool)
+    found = ContactForces(probe[1], force, pressing, depth, slipping, np.zeros((count, 3, 3)), at.copy())
+    _law(at, probe, soften * stiff, anchor, friction, bound, soften, np.empty(3), *list(vars(found).values())[1:])
+    return found
 
 
 @compiled()
 def _law(
-    at: FloatArray, probe: Probe, stiff: FloatArray, anchor: FloatArray, friction: FloatArray, bound: FloatArray, soften: float
-) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, FloatArray, FloatArray]:
+    at: FloatArray,
+    probe: Probe,
+    stiff: FloatArray,
+    anchor: FloatArray,
+    friction: FloatArray,
+    bound: FloatArray,
+    soften: float,
+    way: FloatArray,
+    force: FloatArray,
+    pressing: FloatArray,
+    depth: FloatArray,
+    slipping: BoolArray,
+    k: FloatArray,
+    moved: FloatArray,
+) -> None:
+    """Write the law at the points in contact into the arrays of ``ContactForces``; ``way`` (3,) is work space."""
     (distance, normal, hessian), eps, delta = probe, SMOOTH_GAP_MM / soften, STICK_CREEP_MM / soften
-    count = len(at)
-    force, k = np.zeros((count, 3)), np.zeros((count, 3, 3))
-    pressing, depth = np.zeros(count), np.zeros(count)
-    slipping = np.zeros(count, np.bool_)
-    moved = at.copy()
-    path, travel, way = np.zeros(3), np.zeros(3), np.zeros(3)
-    turn = np.zeros((3, 3))
-    for p in range(count):
-        g = max(-distance[p], 0.0)
-        if g == 0:
+    for p in range(len(at)):
+        g = -distance[p]
+        if not g > 0:
             continue
-        n, h, s = normal[p], hessian[p], stiff[p]
+        press, rise = stiff[p] * (g - eps / 2), stiff[p]
         if g < eps:
-            press, rise = s * g * g / (2 * eps), s * g / eps
-        else:
-            press, rise = s * (g - eps / 2), s
-        depth[p] = g
-        pressing[p] = press
+            press, rise = stiff[p] * g * g / (2 * eps), stiff[p] * g / eps
+        depth[p], pressing[p] = g, press
+        along, length = 0.0, 0.0
         for i in range(3):
-            force[p, i] = press * n[i]
+            force[p, i] = press * normal[p, i]
+            along += (at[p, i] - anchor[p, i]) * normal[p, i]
             for j in range(3):
-                k[p, i, j] = rise * n[i] * n[j] - press * h[i, j]
+                k[p, i, j] = rise * normal[p, i] * normal[p, j] - press * hessian[p, i, j]
         limit, growth = friction[p] * press, friction[p] * rise
         if limit > bound[p]:
             limit, growth = bound[p], 0.0
         if limit == 0:
             continue
-        along, length = 0.0, 0.0
         for i in range(3):
-            path[i] = at[p, i] - anchor[p, i]
-            along += path[i] * n[i]
-        for i in range(3):
-            travel[i] = path[i] - along * n[i]
-            length += travel[i] ** 2
+            way[i] = at[p, i] - anchor[p, i] - along * normal[p, i]
+            length += way[i] ** 2
         length = np.sqrt(length)
-        x = length / delta
-        slip = x >= 1
-        slipping[p] = slip
-        hold = 1.0 if slip else (2 - x) * x
-        across = limit * (hold / length if length > 0 else 2 / delta)
-        along_way = 0.0 if slip else limit * 2 * (1 - x) / delta
+        x = min(length / delta, 1.0)
+        slipping[p] = x == 1
+        hold, ahead = (2 - x) * x, limit * 2 * (1 - x) / delta
+        across = limit * hold / length if length > 0 else limit * 2 / delta
         for i in range(3):
-            way[i] = travel[i] / length if length > 0 else 0.0
+            way[i] /= length if length > 0 else 1.0
             force[p, i] -= limit * hold * way[i]
-            if slip:
-                moved[p, i] = at[p, i] - delta * way[i]
-            else:
-                moved[p, i] = anchor[p, i]
+            moved[p, i] = at[p, i] - delta * way[i] if slipping[p] else anchor[p, i]
         # the normal turns when the point moves: d travel = (I - n n) dx - along dn - n (path . dn), dn = h dx
-        for i in range(3):
-            for j in range(3):
-                bent = along * h[i, j]
-                for m in range(3):
-                    bent += n[i] * path[m] * h[m, j]
-                turn[i, j] = (1.0 if i == j else 0.0) - n[i] * n[j] - bent
-        for i in range(3):
-            for j in range(3):
-                lengthways = 0.0
-                for m in range(3):
-                    lengthways += way[m] * turn[m, j]
-                k[p, i, j] += across * (turn[i, j] - way[i] * lengthways) + along_way * way[i] * lengthways
-                k[p, i, j] -= growth * hold * way[i] * n[j]
-    return force, pressing, depth, slipping, k, moved
+        for j in range(3):
+            turned, bent = normal[p, j], 0.0
+            for m in range(3):
+                turned += (at[p, m] - anchor[p, m]) * hessian[p, m, j]
+                bent += way[m] * hessian[p, m, j]
+            lengthways = (ahead - across) * (way[j] - along * bent) - growth * hold * normal[p, j]
+            for i in range(3):
+                straight = 1.0 if i == j else 0.0
+                k[p, i, j] += across * (straight - normal[p, i] * turned - along * hessian[p, i, j]) + way[i] * lengthways
 
 
 @compiled()
@@ -255,15 +250,13 @@ def spread_stiffness(controls: IntArray, weights: FloatArray, stiffness: FloatAr
     """Add point stiffnesses (p, 3, 3) to the matrix (3 n, 3 n) of the controls' unknowns; controls numbered n or more are omitted."""
     count = len(out) // 3
     for p in range(len(controls)):
-        k = stiffness[p]
-        if k.any():
-            for a in range(9):
-                row = controls[p, a]
-                if row < count:
-                    for b in range(9):
-                        column = controls[p, b]
-                        if column < count:
-                            share = weights[p, a] * weights[p, b]
-                            for i in range(3):
-                                for j in range(3):
-                                    out[3 * row + i, 3 * column + j] += share * k[i, j]
+        size = 0.0
+        for i in range(3):
+            size += abs(stiffness[p, i, 0]) + abs(stiffness[p, i, 1]) + abs(stiffness[p, i, 2])
+        for a in range(9 if size > 0 else 0):
+            for b in range(9):
+                row, column, share = controls[p, a], controls[p, b], weights[p, a] * weights[p, b]
+                if row < count and column < count:
+                    for i in range(3):
+                        for j in range(3):
+                            out[3 * row + i, 3 * column + j] += share * stiffness[p, i, j]

@@ -213,7 +213,7 @@ class SkinFit:
         total = np.zeros(size * size)
         for kind, where in zip(self._kinds, self._entries, strict=True):
             controls = kind.cells.controls
-            block = np.zeros((len(controls), 6, controls.shape[1], controls.shape[1]))
+            block = np.zeros((len(controls), 6, controls.shape[1], controls.shape[1]), np.float32)
             kind.stiffness(control_mm, 0.0, block)
             total += np.bincount(where, block.ravel(), size * size)
         matrix, shift = total.reshape(size, size)[:-1, :-1].astype(np.float32), 0.0

@@ -24,11 +24,6 @@ PLANE, ROUND, EDGE, PRISM = range(4)
 
 
 @compiled(error_model="numpy")
-def _results(count: int) -> Probe:
-    return np.empty(count), np.zeros((count, 3)), np.zeros((count, 3, 3))
-
-
-@compiled(error_model="numpy")
 def _write(normal: FloatArray, hessian: FloatArray, k: int, n: Triple, a: Triple, radius: float) -> None:
     """Write point k's normal n and Hessian (I - n n - a a) / radius. Plain numbers are used, because slices of arrays would be slower."""
     normal[k, 0], normal[k, 1], normal[k, 2] = n
@@ -39,32 +34,27 @@ def _write(normal: FloatArray, hessian: FloatArray, k: int, n: Triple, a: Triple
 
 
 @compiled(error_model="numpy")
-def plane(points: FloatArray) -> Probe:
+def plane(points: FloatArray, distance: FloatArray, normal: FloatArray, hessian: FloatArray) -> None:
     """Half space behind the origin."""
-    distance, normal, hessian = _results(len(points))
     for k in range(len(points)):
         distance[k] = -points[k, 2]
         normal[k, 2] = -1.0
-    return distance, normal, hessian
 
 
 @compiled(error_model="numpy")
-def round_solid(points: FloatArray, radius: float, along_y: float) -> Probe:
+def round_solid(points: FloatArray, radius: float, along_y: float, distance: FloatArray, normal: FloatArray, hessian: FloatArray) -> None:
     """Ball, or cylinder along y (``along_y`` 1.0, for the ball 0.0), behind the origin."""
-    distance, normal, hessian = _results(len(points))
     for k in range(len(points)):
         x, y, z = points[k, 0], points[k, 1] * (1 - along_y), points[k, 2] - radius
         away = np.sqrt(x * x + y * y + z * z)
         distance[k] = away - radius
         n = (x / away, y / away, z / away) if away > 0 else (0.0, 0.0, -1.0)
         _write(normal, hessian, k, n, (0.0, along_y, 0.0), away)
-    return distance, normal, hessian
 
 
 @compiled(error_model="numpy")
-def edge(points: FloatArray, fillet: float) -> Probe:
+def edge(points: FloatArray, fillet: float, distance: FloatArray, normal: FloatArray, hessian: FloatArray) -> None:
     """Quarter space with a rounded edge along y."""
-    distance, normal, hessian = _results(len(points))
     for k in range(len(points)):
         # distances of the point in front of the faces, which are moved inwards by the fillet
         x, z = fillet - points[k, 0], fillet - points[k, 2]
@@ -76,7 +66,6 @@ def edge(points: FloatArray, fillet: float) -> Probe:
             face = 0 if x >= z else 2
             distance[k] = -points[k, face]
             normal[k, face] = -1.0
-    return distance, normal, hessian
 
 
 @compiled(error_model="numpy")
@@ -86,13 +75,21 @@ def _sector(x: float, z: float, sides: int) -> int:
 
 
 @compiled(error_model="numpy")
-def prism(points: FloatArray, sides: int, inradius: float, fillet: float, taper: float) -> Probe:
+def prism(
+    points: FloatArray,
+    sides: int,
+    inradius: float,
+    fillet: float,
+    taper: float,
+    distance: FloatArray,
+    normal: FloatArray,
+    hessian: FloatArray,
+) -> None:
     """Prism. Each point is rotated into the sector of its nearest face, with the coordinates: outwards, along the face, y.
 
     In this sector the nearest point of the polyhedron, whose faces are moved inwards by the fillet, is on that face or on the edge
     between two faces.
     """
-    distance, normal, hessian = _results(len(points))
     lean_out, lean_y = np.cos(taper), np.sin(taper)
     half = np.tan(np.pi / sides)
     size = np.sqrt(1 + (lean_y * half) ** 2)
@@ -119,19 +116,21 @@ def prism(points: FloatArray, sides: int, inradius: float, fillet: float, taper:
         n = (p * sin + q * mirror * cos, r, -p * cos + q * mirror * sin)
         a = (edge_out * sin + edge_along * mirror * cos, edge_y, -edge_out * cos + edge_along * mirror * sin)
         _write(normal, hessian, k, n, a, away)
-    return distance, normal, hessian
 
 
 @compiled(error_model="numpy")
 def solid(points: FloatArray, kind: int, sizes: FloatArray) -> Probe:
     """The solid of a kind, with the numbers that its function takes, in their order."""
+    distance, normal, hessian = np.empty(len(points)), np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
     if kind == ROUND:
-        return round_solid(points, sizes[0], sizes[1])
-    if kind == EDGE:
-        return edge(points, sizes[0])
-    if kind == PRISM:
-        return prism(points, int(sizes[0]), sizes[1], sizes[2], sizes[3])
-    return plane(points)
+        round_solid(points, sizes[0], sizes[1], distance, normal, hessian)
+    elif kind == EDGE:
+        edge(points, sizes[0], distance, normal, hessian)
+    elif kind == PRISM:
+        prism(points, int(sizes[0]), sizes[1], sizes[2], sizes[3], distance, normal, hessian)
+    else:
+        plane(points, distance, normal, hessian)
+    return distance, normal, hessian
 
 
 @compiled(error_model="numpy")
@@ -173,13 +172,13 @@ class CompiledSolid(Wrapped):
     kind : int
         See ``solid``.
     kernel : callable
-        Function of the points and the ``sizes``.
+        Function of the points, the ``sizes``, and the arrays of a ``Probe``, which it fills; the last two are 0 before.
     further : tuple of float
         Numbers that the kernel takes besides the solid's fields.
     """
 
     kind: ClassVar[int]
-    kernel: ClassVar[Callable[..., Probe]]
+    kernel: ClassVar[Callable[..., None]]
     further: ClassVar[tuple[float, ...]] = ()
 
     @property
@@ -188,7 +187,9 @@ class CompiledSolid(Wrapped):
         return *vars(self).values(), *self.further
 
     def probe(self, points_mm: FloatArray) -> Probe:
-        return type(self).kernel(rows(points_mm), *self.sizes)
+        found = np.empty(len(points_mm)), np.zeros((len(points_mm), 3)), np.zeros((len(points_mm), 3, 3))
+        type(self).kernel(rows(points_mm), *self.sizes, *found)
+        return found
 
 
 @dataclass(frozen=True)

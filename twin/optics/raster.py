@@ -80,7 +80,6 @@ def _hull(near: FloatArray, far: FloatArray) -> FloatArray:
     return np.where((np.sum((far - near) * outward, axis=-1) > 0)[..., None], far, near)
 
 
-@compiled(error_model="numpy")
 def draw_pins(
     image: FloatArray, outlines: FloatArray, lights: tuple[FloatArray, FloatArray, FloatArray], facing: BoolArray, order: IntArray
 ) -> None:
@@ -101,107 +100,104 @@ def draw_pins(
     order : (N,) int
         Numbers of the pins in the order of drawing.
     """
+    xy = np.ascontiguousarray(np.moveaxis(outlines, -1, 0))
+    bodies = xy[:, :, 0], xy[:, :, 1:].reshape(*xy.shape[:2], -1)
+    low, high = (np.moveaxis([reduce(body, axis=2) for body in bodies], 1, -1) for reduce in (np.min, np.max))  # (2, N, 2)
+    drawn = ((high > -0.5) & (low < np.array(image.shape[1::-1]) - 0.5)).all(axis=2)
+    low, high = np.where(drawn[..., None], [low, high], 0.0)
+    # two additional columns take what an edge adds beyond the last pixel; the last channel is the covered share
+    first = np.floor(low + 0.5).astype(int)
+    boxes = np.concatenate([first, (high + 0.5).astype(int) - first + [3, 1]], axis=2)
+    stem, side, face = lights
+    light = np.concatenate([stem[:, None], side, face[:, None] * facing[:, None, None]], axis=1)
+    after, before = np.roll(xy, -1, axis=3), xy[:, :, ::3]
+    stems, ends = np.sign(_cross(before, after[:, :, ::3]).sum(axis=2)).T
+    shown = np.sign(_cross(after[:, :, 2:] - xy[:, :, 1:3], xy[:, :, 2:] - after[:, :, 1:3])).reshape(side.shape[:2])
+    sense = np.where(facing, ends, -ends)[:, None]
+    senses = np.column_stack([stems, np.where(shown == sense, sense, 0), ends])
+    cover = np.zeros((boxes[..., 3].max(), boxes[..., 2].max(), image.shape[2] + 1))
+    _draw(image, outlines, light, senses, facing, drawn, boxes, order, cover)
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """The z components (...) of cross products of vectors (2, ...)."""
+    return a[0] * b[1] - a[1] * b[0]
+
+
+@compiled(error_model="numpy")
+def _draw(
+    image: FloatArray,
+    outlines: FloatArray,
+    light: FloatArray,
+    senses: FloatArray,
+    facing: BoolArray,
+    drawn: BoolArray,
+    boxes: IntArray,
+    order: IntArray,
+    cover: FloatArray,
+) -> None:
+    """Draw the facets of all pins: the stem, the wall, the bevel, the face. A facet of sense 0 is out of sight.
+
+    Each edge of a facet adds to each row of ``cover`` the area on its right, as differences along the row. Their cumulative sum is the
+    coverage. ``cover`` is 0 before and after.
+    """
     height, width, channels = image.shape
-    sides, (stem_light, side_light, face_light) = outlines.shape[2], lights
-    quad, black = np.empty((4, 2)), np.zeros(channels, np.float32)
+    sides, last = outlines.shape[2], senses.shape[1] - 1
     for p in order:
         for body in range(2):
-            shapes = outlines[p, 1:] if body else outlines[p, :1]
-            left, right, top, bottom = shapes[..., 0].min(), shapes[..., 0].max(), shapes[..., 1].min(), shapes[..., 1].max()
-            if not (right > -0.5 and bottom > -0.5 and left < width - 0.5 and top < height - 0.5):
+            if not drawn[body, p]:
                 continue
-            x0, y0 = int(np.floor(left + 0.5)), int(np.floor(top + 0.5))
-            # two additional columns take what an edge adds beyond the last pixel; the last channel is the covered share
-            cover = np.zeros((int(bottom + 0.5) - y0 + 1, int(right + 0.5) - x0 + 3, channels + 1))
-            if not body:
-                _add_polygon(cover, shapes[0], stem_light[p], x0, y0, np.sign(_area(shapes[0])))
-            else:
-                sense = np.sign(_area(shapes[2])) * (1 if facing[p] else -1)
-                for band in range(2):
-                    for k in range(sides):
-                        after = (k + 1) % sides
-                        for x in range(2):
-                            quad[0, x], quad[1, x] = shapes[band, k, x], shapes[band, after, x]
-                            quad[2, x], quad[3, x] = shapes[band + 1, after, x], shapes[band + 1, k, x]
-                        if sense * _area(quad) > 0:
-                            _add_polygon(cover, quad, side_light[p, band * sides + k], x0, y0, sense)
-                if facing[p]:
-                    _add_polygon(cover, shapes[2], face_light[p], x0, y0, sense)
-                else:
-                    _add_polygon(cover, shapes[0], black, x0, y0, -sense)
-            _blend(image, cover, x0, y0)
-
-
-@compiled(error_model="numpy")
-def _area(polygon: FloatArray) -> float:
-    total = 0.0
-    for k in range(len(polygon)):
-        total += polygon[k - 1, 0] * polygon[k, 1] - polygon[k, 0] * polygon[k - 1, 1]
-    return 0.5 * total
-
-
-@compiled(error_model="numpy")
-def _blend(image: FloatArray, cover: FloatArray, x0: int, y0: int) -> None:
-    """Draw the cumulative sum of each row of differences (h, w + 2, C + 1) over the image, its first pixel at (x0, y0)."""
-    height, width, channels = image.shape
-    total = np.empty(channels + 1)
-    for y in range(max(y0, 0), min(y0 + cover.shape[0], height)):
-        total[:] = 0.0
-        for x in range(x0, min(x0 + cover.shape[1] - 2, width)):
-            for c in range(channels + 1):
-                total[c] += cover[y - y0, x - x0, c]
-            if x >= 0 and total[channels] > 0:
-                left = max(1 - total[channels], 0.0)
-                for c in range(channels):
-                    image[y, x, c] = left * image[y, x, c] + total[c]
-
-
-@compiled(error_model="numpy")
-def _add_polygon(cover: FloatArray, polygon: FloatArray, light: FloatArray, x0: int, y0: int, sense: float) -> None:
-    """Add a polygon (K, 2) to differences along the rows of a box from (x0, y0). ``sense`` is the sign of the polygon's area.
-
-    Each edge adds to each row the area on its right. The cumulative sum of a row is the coverage.
-    """
-    count = len(polygon)
-    for k in range(count):
-        ax, ay = polygon[k, 0] - x0 + 0.5, polygon[k, 1] - y0 + 0.5
-        bx, by = polygon[(k + 1) % count, 0] - x0 + 0.5, polygon[(k + 1) % count, 1] - y0 + 0.5
-        if ay == by:
-            continue
-        sign = -sense
-        if ay > by:
-            ax, ay, bx, by, sign = bx, by, ax, ay, sense
-        slope = (bx - ax) / (by - ay)
-        for row in range(int(ay), min(int(np.ceil(by)), len(cover))):
-            low, high = max(float(row), ay), min(row + 1.0, by)
-            _add_edge(cover[row], light, ax + slope * (low - ay), ax + slope * (high - ay), sign * (high - low))
-
-
-@compiled(error_model="numpy")
-def _add_edge(row: FloatArray, light: FloatArray, start: float, end: float, rise: float) -> None:
-    """Add an edge to a row of differences (w, C + 1). Within the row the edge goes from x = start to x = end and rises by ``rise``."""
-    left, right = min(start, end), max(start, end)
-    first, last = int(left), int(right)
-    steep = rise if first == last else rise / (right - left)
-    for x in range(first, last + 1):  # the part of the edge within pixel x
-        a, b = max(left, float(x)), min(right, x + 1.0)
-        part = steep if first == last else steep * (b - a)
-        beyond = 0.5 * (a + b) - x
-        for c in range(len(light)):
-            row[x, c] += part * (1 - beyond) * light[c]
-            row[x + 1, c] += part * beyond * light[c]
-        row[x, len(light)] += part * (1 - beyond)
-        row[x + 1, len(light)] += part * beyond
+            x0, y0, columns, rows = boxes[body, p, 0], boxes[body, p, 1], boxes[body, p, 2], boxes[body, p, 3]
+            for facet in range(body, last + 1 if body else 1):
+                if senses[p, facet] == 0:
+                    continue
+                band, k = 1 + (facet - 1) // sides, (facet - 1) % sides
+                whole = facet == 0 or facet == last
+                if whole:
+                    band = 0 if facet == 0 else 3 if facing[p] else 1
+                for e in range(sides if whole else 4):
+                    r0, c0, r1, c1 = band, e, band, (e + 1) % sides
+                    if not whole:  # around the facet: k, k + 1, and both in the next outline
+                        r0, r1, c0, c1 = band + e // 2, band + (e + 1) // 2 % 2, (k + (e + 1) // 2 % 2) % sides, (k + (e < 2)) % sides
+                    ax, ay = outlines[p, r0, c0, 0] - x0 + 0.5, outlines[p, r0, c0, 1] - y0 + 0.5
+                    bx, by = outlines[p, r1, c1, 0] - x0 + 0.5, outlines[p, r1, c1, 1] - y0 + 0.5
+                    if ay == by:
+                        continue
+                    sign = -senses[p, facet]
+                    if ay > by:
+                        ax, ay, bx, by, sign = bx, by, ax, ay, -sign
+                    slope = (bx - ax) / (by - ay)
+                    for y in range(int(ay), min(int(np.ceil(by)), rows)):
+                        low, high = max(float(y), ay), min(y + 1.0, by)
+                        start, end = ax + slope * (low - ay), ax + slope * (high - ay)
+                        left, right, rise = min(start, end), max(start, end), sign * (high - low)
+                        for x in range(int(left), int(right) + 1):  # the part of the edge within pixel x
+                            a, b = max(left, float(x)), min(right, x + 1.0)
+                            part = rise if int(left) == int(right) else rise / (right - left) * (b - a)
+                            beyond = 0.5 * (a + b) - x
+                            for c in range(channels + 1):
+                                share = part * light[p, facet, c] if c < channels else part
+                                cover[y, x, c] += share * (1 - beyond)
+                                cover[y, x + 1, c] += share * beyond
+            for y in range(rows):
+                for x in range(columns):
+                    total = cover[y, x, channels]
+                    seen = total > 0 and x < columns - 2 and 0 <= x + x0 < width and 0 <= y + y0 < height
+                    for c in range(channels + 1):
+                        value, cover[y, x, c] = cover[y, x, c], 0.0
+                        if x + 1 < columns:
+                            cover[y, x + 1, c] += value
+                        if seen and c < channels:
+                            image[y + y0, x + x0, c] = max(1 - total, 0.0) * image[y + y0, x + x0, c] + value
 
 
 @compiled(error_model="numpy")
 def draw_triangles(image: FloatArray, corners: FloatArray, light: FloatArray, faces: IntArray) -> None:
     """Fill the pixels whose centres lie in triangles ``faces (m, 3)`` over corners (v, 2) with linearly interpolated lights (v, C)."""
     height, width, channels = image.shape
-    at = np.empty(channels)
     for f in range(len(faces)):
-        i, j, k = faces[f]
-        ax, ay = corners[i]
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        ax, ay = corners[i, 0], corners[i, 1]
         bx, by = corners[j, 0] - ax, corners[j, 1] - ay
         cx, cy = corners[k, 0] - ax, corners[k, 1] - ay
         area = bx * cy - cx * by
@@ -222,10 +218,9 @@ def draw_triangles(image: FloatArray, corners: FloatArray, light: FloatArray, fa
             s, t = s0 + sx * (x0 - ax), t0 + tx * (x0 - ax)
             for c in range(channels):
                 dj, dk = light[j, c] - light[i, c], light[k, c] - light[i, c]
-                at[c] = light[i, c] + s * dj + t * dk
-                step = sx * dj + tx * dk
+                start, step = light[i, c] + s * dj + t * dk, sx * dj + tx * dk
                 for x in range(x0, x1 + 1):
-                    image[y, x, c] = at[c] + step * (x - x0)
+                    image[y, x, c] = start + step * (x - x0)
 
 
 @compiled(error_model="numpy")

@@ -24,21 +24,21 @@ locking. No mode loses its stiffness, because the splines are C1.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from math import prod
 
 import numpy as np
 
 from scenes.body import GelSpec, RelaxationTerm, SkinSpec
 from twin.compiled import compiled
 from twin.geometry.solid import Cells, Solid
-from twin.mechanics.body.material import distortion_stiffness, distortion_stress, first_piola, invariants, law_coefficients, second_stress
-from twin.types import BoolArray, FloatArray, IntArray
+from twin.mechanics.body.material import distortion_stress, first_part, law_coefficients
+from twin.types import FloatArray
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # directions (i, k) of the stored stiffness blocks
 FIRST, SECOND = np.array([*zip(*PAIRS, strict=True)])
-Parts: TypeAlias = tuple[Cells, FloatArray, FloatArray, FloatArray]
 _FAR_STRAIN = 1e9
 """Initial value of the entries of the stored F. No element has such an F, so all blocks are computed at the first update."""
+_NO_FORCE, _NO_STRAIN, _NO_BLOCKS = np.zeros((0, 3)), np.zeros((0, 72)), np.zeros((0, 0, 0), np.float32)
 
 
 @dataclass(frozen=True)
@@ -68,11 +68,11 @@ class Elements:
         ``pressure_mpa`` (positive: tension) adds its work on the change of volume. If an element is inside out, the energy is infinite and
         ``out`` is not valid.
         """
-        return _forces(self._parts, np.ascontiguousarray(control_mm), pressure_mpa, out)
+        return self._evaluate(control_mm, pressure_mpa, out)
 
     def add_volume(self, control_mm: FloatArray, out: FloatArray) -> float:
         """Increase of the volume in mm^3. The method adds its gradient with respect to the controls, in mm^2, to ``out`` (n, 3)."""
-        return _forces((self.cells, np.zeros(6), np.zeros(0), np.zeros((0, 8, 3, 3))), np.ascontiguousarray(control_mm), 1.0, out)
+        return Elements(self.cells, np.zeros(6))._evaluate(control_mm, 1.0, out)
 
     @property
     def rest_volume_mm3(self) -> float:
@@ -88,22 +88,32 @@ class Elements:
         swelling = (weights * np.linalg.det(f)).reshape(-1, 2, 4).sum(axis=2) / weights.reshape(-1, 2, 4).sum(axis=2)
         return distortion_stress(self.law, f), self.law[5] * (swelling[:, 0] - swelling[:, 1]) / 2
 
-    def stiffness(self, control_mm: FloatArray, pressure_mpa: float, out: FloatArray, *, which: IntArray | None = None) -> None:
+    def stiffness(
+        self, control_mm: FloatArray, pressure_mpa: float, out: FloatArray, *, at: FloatArray | None = None, strain: float = 0.0
+    ) -> None:
         """Write the second derivative of each element's energy, N/mm, into ``out`` (m, 6, b, b), in the precision of ``out``.
 
         Block p couples direction ``PAIRS[p][0]`` of the first control with direction ``PAIRS[p][1]`` of the second; the other three blocks
-        are transposes. With ``which`` (k,) int, only the blocks of these elements are computed.
+        are transposes. With ``at`` (m, 72), only the blocks of the elements in which an entry of F differs from it by more than ``strain``
+        are computed, and it receives their new F.
         """
-        which = np.arange(len(out)) if which is None else which
-        _stiffness(self._parts, which, np.ascontiguousarray(control_mm), pressure_mpa, out)
+        self._evaluate(control_mm, pressure_mpa, _NO_FORCE, out, np.full((len(out), 72), _FAR_STRAIN) if at is None else at, strain)
 
-    def find_changed(self, control_mm: FloatArray, at: FloatArray, strain: float) -> IntArray:
-        """Elements (k,) in which an entry of F differs from ``at`` (m, 8, 3, 3) by more than ``strain``; ``at`` receives their new F."""
-        return np.flatnonzero(_find_changed(self.cells, np.ascontiguousarray(control_mm), strain, at))
-
-    @property
-    def _parts(self) -> Parts:
-        return self.cells, self.law, self.difference_mpa, self.stress
+    def _evaluate(
+        self,
+        control_mm: FloatArray,
+        pressure_mpa: float,
+        force: FloatArray,
+        out: FloatArray = _NO_BLOCKS,
+        at: FloatArray = _NO_STRAIN,
+        strain: float = 0.0,
+    ) -> float:
+        count, blocks = self.cells.controls.shape[1], out.reshape(len(out), prod(out.shape[1:-1]), out.shape[-1])
+        f, rows, columns = np.empty((8, 3, 3)), *blocks.shape[1:]
+        points = f, f.ravel(), np.empty((8, 3, 3)), np.empty(8), np.empty((8, 3, 3)), np.zeros((3, 3, 3)), np.empty((4, 3, 3))
+        sums = np.empty((3, count)), np.zeros((2, 3, count)), np.zeros((30, rows), out.dtype), np.empty((30, columns), out.dtype)
+        parts = self.cells, self.law, self.difference_mpa, self.stress
+        return _evaluate(parts, np.ascontiguousarray(control_mm), pressure_mpa, force, (strain, at, blocks), (*points, *sums))
 
 
 def soft_body(solid: Solid, skin: SkinSpec, gel: GelSpec) -> tuple[Elements, Elements, Elements]:
@@ -133,7 +143,7 @@ class KeptStiffness:
         count, controls = kind.cells.controls.shape
         self._kept_strain = kept_strain
         self.blocks = np.empty((count, 6, controls, controls), np.float32)
-        self._at = np.empty((count, 8, 3, 3))
+        self._at = np.empty((count, 72))
         self._made_of: tuple[Elements, float] | None = None
 
     def update(self, kind: Elements, control_mm: FloatArray, pressure_mpa: float, *, fresh: bool) -> None:
@@ -142,8 +152,7 @@ class KeptStiffness:
         if fresh or len(kind.stress) or not same:
             self._at[:] = _FAR_STRAIN
         self._made_of = kind, pressure_mpa
-        which = kind.find_changed(control_mm, self._at, self._kept_strain)
-        kind.stiffness(control_mm, pressure_mpa, self.blocks, which=which)
+        kind.stiffness(control_mm, pressure_mpa, self.blocks, at=self._at, strain=self._kept_strain)
 
 
 @dataclass(frozen=True)
@@ -214,185 +223,160 @@ def _decay(terms: tuple[RelaxationTerm, ...], step_s: float) -> tuple[FloatArray
 
 
 @compiled(fastmath=True)
-def gather(control: FloatArray, which: IntArray, x: FloatArray) -> None:
-    """Write the positions of the controls ``which`` (b,) into ``x`` (3, b)."""
-    for a in range(len(which)):
-        for i in range(3):
-            x[i, a] = control[which[a], i]
+def _evaluate(
+    parts: tuple[Cells, FloatArray, FloatArray, FloatArray],
+    control: FloatArray,
+    sealing: float,
+    force: FloatArray,
+    wanted: tuple[float, FloatArray, FloatArray],
+    work: tuple[FloatArray, ...],
+) -> float:
+    """Add the gradient of the energy to ``force`` (n, 3) and return the energy, or write the stiffness blocks.
 
+    ``wanted`` are the arguments strain, at and out of ``Elements.stiffness``; out (m, 6 b, b) without elements selects the forces.
+    With g = F^-T, c = c01 J^(2/3), B = g g^T, C = g^T g and h = c B g, the stress is P = slope F + across g - 2 h, and its derivative
 
-@compiled(fastmath=True)
-def deformation(x: FloatArray, slopes: FloatArray, f: FloatArray) -> None:
-    """Write F at a place where the splines have ``slopes`` (3, b) into ``f`` (3, 3)."""
-    for j in range(3):
-        f0, f1, f2 = 0.0, 0.0, 0.0
-        for a in range(x.shape[1]):
-            slope = slopes[j, a]
-            f0 += x[0, a] * slope
-            f1 += x[1, a] * slope
-            f2 += x[2, a] * slope
-        f[0, j], f[1, j], f[2, j] = f0, f1, f2
+        dP[i, j] / dF[k, n] = bend F[i, j] F[k, n] + u[i, j] g[k, n] + g[i, j] u[k, n] + v[i, n] g[k, j] + g[i, n] v[k, j]
+                              + 2 c B[i, k] C[j, n] + (i == k) (slope (j == n) + S[j, n])
 
-
-@compiled(fastmath=True)
-def _find_changed(cells: Cells, control: FloatArray, strain: float, at: FloatArray) -> BoolArray:
-    elements, gradients, _ = cells
-    x, f = np.zeros((3, elements.shape[1])), np.zeros((8, 3, 3))
-    out = np.zeros(len(elements), np.bool_)
-    for m in range(len(elements)):
-        gather(control, elements[m], x)
-        for q in range(8):
-            deformation(x, gradients[m, q], f[q])
-        last = at[m].ravel()
-        new = f.ravel()
-        most = 0.0
-        for k in range(72):
-            most = max(most, abs(new[k] - last[k]))
-        if most > strain:
-            out[m] = True
-            for k in range(72):
-                last[k] = new[k]
-    return out
-
-
-@compiled(fastmath=True)
-def _push(grad: FloatArray, weights: FloatArray, stress: FloatArray, out: FloatArray) -> None:
-    """Write the nodal forces of the first Piola-Kirchhoff stress at the Gauss points into ``out`` (3, b), one column per control."""
-    out[:] = 0.0
-    for q in range(8):
-        w = weights[q]
-        s00, s01, s02 = w * stress[q, 0, 0], w * stress[q, 0, 1], w * stress[q, 0, 2]
-        s10, s11, s12 = w * stress[q, 1, 0], w * stress[q, 1, 1], w * stress[q, 1, 2]
-        s20, s21, s22 = w * stress[q, 2, 0], w * stress[q, 2, 1], w * stress[q, 2, 2]
-        for a in range(out.shape[1]):
-            g0, g1, g2 = grad[q, 0, a], grad[q, 1, a], grad[q, 2, a]
-            out[0, a] += s00 * g0 + s01 * g1 + s02 * g2
-            out[1, a] += s10 * g0 + s11 * g1 + s12 * g2
-            out[2, a] += s20 * g0 + s21 * g1 + s22 * g2
-
-
-@compiled(fastmath=True)
-def _kinematics(
-    x: FloatArray, grad: FloatArray, weights: FloatArray, f: FloatArray, det: FloatArray, g: FloatArray
-) -> tuple[float, float, float, float]:
-    """Write F, det F and F^-T at all points; returns the volumes of the levels, at rest and deformed.
-
-    The first volume is negative if the element is inside out.
+    with combinations u and v of F, g and h. Forces and stiffness are one function, because most of its code serves both.
     """
-    v0, v1, r0, r1 = 0.0, 0.0, 0.0, 0.0
-    for q in range(8):
-        deformation(x, grad[q], f[q])
-    for q in range(8):
-        det[q] = invariants(f[q], g[q])
-        if det[q] <= 0:
-            return -1.0, 0.0, 0.0, 0.0
-        if q < 4:
-            r0 += weights[q]
-            v0 += weights[q] * det[q]
-        else:
-            r1 += weights[q]
-            v1 += weights[q] * det[q]
-    return r0, r1, v0, v1
-
-
-@compiled(fastmath=True)
-def _add_prescribed(given: FloatArray, f: FloatArray, weights: FloatArray, stress: FloatArray) -> float:
-    """Add a given second Piola-Kirchhoff stress to the first Piola-Kirchhoff stress at all points; returns its energy."""
-    energy = 0.0
-    for q in range(8):
-        for i in range(3):
-            for j in range(3):
-                total = 0.0
-                for k in range(3):
-                    total += f[q, i, k] * given[q, k, j]
-                stress[q, i, j] += total
-                energy += weights[q] * total * f[q, i, j] / 2
-    return energy
-
-
-@compiled(fastmath=True)
-def _forces(parts: Parts, control: FloatArray, sealing: float, out: FloatArray) -> float:
     (elements, gradients, weights), law, extra, given = parts
-    count = elements.shape[1]
-    x, push = np.zeros((3, count)), np.zeros((3, count))
-    f, g, stress = np.zeros((8, 3, 3)), np.zeros((8, 3, 3)), np.zeros((8, 3, 3))
-    det = np.zeros(8)
-    energy = 0.0
+    strain, at, blocks = wanted
+    f, flat, g, det, stress, second, mixed, x, push, left, right = work
+    count, energy, stiff = elements.shape[1], 0.0, len(blocks) > 0
     for m in range(len(elements)):
-        gather(control, elements[m], x)
-        r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, det, g)
-        if r0 < 0:
-            return np.inf
+        for a in range(count):
+            for i in range(3):
+                x[i, a] = control[elements[m, a], i]
+        for q in range(8):
+            for j in range(3):
+                f0, f1, f2 = 0.0, 0.0, 0.0
+                for a in range(count):
+                    slope = gradients[m, q, j, a]
+                    f0 += x[0, a] * slope
+                    f1 += x[1, a] * slope
+                    f2 += x[2, a] * slope
+                f[q, 0, j], f[q, 1, j], f[q, 2, j] = f0, f1, f2
+        if stiff:
+            most = 0.0
+            for k in range(72):
+                most = max(most, abs(flat[k] - at[m, k]))
+            if most <= strain:
+                continue
+            for k in range(72):
+                at[m, k] = flat[k]
+        v0, v1, r0, r1 = 0.0, 0.0, 0.0, 0.0
+        for q in range(8):
+            for i in range(3):
+                k, n = (i + 1) % 3, (i + 2) % 3
+                for j in range(3):
+                    a, o = (j + 1) % 3, (j + 2) % 3
+                    g[q, i, j] = f[q, k, a] * f[q, n, o] - f[q, k, o] * f[q, n, a]
+            d = f[q, 0, 0] * g[q, 0, 0] + f[q, 0, 1] * g[q, 0, 1] + f[q, 0, 2] * g[q, 0, 2]
+            if d <= 0:
+                return np.inf
+            det[q] = d
+            for i in range(3):
+                for j in range(3):
+                    g[q, i, j] /= d
+            if q < 4:
+                r0 += weights[m, q]
+                v0 += weights[m, q] * d
+            else:
+                r1 += weights[m, q]
+                v1 += weights[m, q] * d
         rest = r0 + r1
         mean, half = (v0 + v1) / rest - 1, (v0 / r0 - v1 / r1) / 2
         more = extra[m] if len(extra) else 0.0
         energy += rest * (law[4] / 2 * mean**2 + law[5] / 2 * half**2 + sealing * mean + more * half)
-        pressure, lean = sealing + law[4] * mean, (law[5] * half + more) * rest / 2
+        lean0, lean1 = rest / (2 * r0), -rest / (2 * r1)
         for q in range(8):
-            push_out = pressure + (lean / r0 if q < 4 else -lean / r1)
-            energy += weights[m, q] * first_piola(law, f[q], det[q], g[q], push_out, stress[q])
-        if law[1] != 0:
-            for q in range(8):
-                energy += weights[m, q] * second_stress(law[1], f[q], det[q], g[q], stress[q])
-        if len(given):
-            energy += _add_prescribed(given[m], f, weights[m], stress)
-        _push(gradients[m], weights[m], stress, push)
-        for a in range(count):
+            w, d = weights[m, q], det[q]
+            pressure = (sealing + law[4] * mean + (law[5] * half + more) * (lean0 if q < 4 else lean1)) * d
+            trace, scale, bulk, c01 = 0.0, d ** (-2 / 3), 0.0, 0.0
             for i in range(3):
-                out[elements[m, a], i] += push[i, a]
-    return energy
-
-
-@compiled(fastmath=True)
-def _stiffness(parts: Parts, which: IntArray, control: FloatArray, sealing: float, out: FloatArray) -> None:
-    (elements, gradients, weights), law, extra, given = parts
-    count = elements.shape[1]
-    x = np.zeros((3, count))
-    f, g = np.zeros((8, 3, 3)), np.zeros((8, 3, 3))
-    det = np.zeros(8)
-    tangent = np.zeros((3, 3, 3, 3))
-    left, right = np.zeros((24, 6 * count), out.dtype), np.zeros((24, count), out.dtype)
-    swell, product = np.zeros((2, 3, count), out.dtype), np.zeros((6 * count, count), out.dtype)
-    scale = np.zeros(2, out.dtype)
-    for m in which:
-        gather(control, elements[m], x)
-        grad = gradients[m].reshape(24, count)
-        r0, r1, v0, v1 = _kinematics(x, gradients[m], weights[m], f, det, g)
-        rest = r0 + r1
-        mean, half = (v0 + v1) / rest - 1, (v0 / r0 - v1 / r1) / 2
-        more = extra[m] if len(extra) else 0.0
-        swell[:] = 0.0
-        for q in range(8):
-            w = weights[m, q]
-            lean = rest / (2 * r0) if q < 4 else -rest / (2 * r1)
-            push = (sealing + law[4] * mean + (law[5] * half + more) * lean) * det[q]
-            distortion_stiffness(law, f[q], det[q], g[q], tangent)
+                for j in range(3):
+                    trace += f[q, i, j] ** 2
+            stored, slope, bend = first_part(law, scale * trace - 3)
+            slope, bend = 2 * scale * slope, 4 * scale * scale * bend
+            if law[1] != 0:
+                c01 = law[1] / scale
+                for i in range(3):
+                    for j in range(3):
+                        b, c = 0.0, 0.0
+                        for k in range(3):
+                            b += g[q, i, k] * g[q, j, k]
+                            c += g[q, k, i] * g[q, k, j]
+                        second[0, i, j], second[1, i, j] = b, c
+                for i in range(3):
+                    bulk += c01 * second[0, i, i]
+                    for j in range(3):
+                        h = 0.0
+                        for k in range(3):
+                            h += second[0, i, k] * g[q, k, j]
+                        second[2, i, j] = c01 * h
+            if not stiff:
+                energy += w * (stored + bulk - 3 * law[1])
+                across = pressure - slope * trace / 3 + 2 / 3 * bulk
+                for i in range(3):
+                    for j in range(3):
+                        stress[q, i, j] = slope * f[q, i, j] + across * g[q, i, j] - 2 * second[2, i, j]
+                        if len(given):
+                            total = f[q, i, 0] * given[m, q, 0, j] + f[q, i, 1] * given[m, q, 1, j] + f[q, i, 2] * given[m, q, 2, j]
+                            stress[q, i, j] += total
+                            energy += w * total * f[q, i, j] / 2
+                continue
+            along, across = -2 / 3 * slope - bend * trace / 3, (trace * (2 * slope + bend * trace) + 4 * bulk) / 18 + pressure / 2
+            crossed = slope * trace / 6 - pressure / 2 - bulk / 3
+            for i in range(3):
+                for j in range(3):
+                    mixed[0, i, j] = along * f[q, i, j] + across * g[q, i, j] - 4 / 3 * second[2, i, j]
+                    mixed[1, i, j] = crossed * g[q, i, j] + 2 * second[2, i, j]
+                    mixed[2, i, j] = slope if i == j else 0.0
+                    if len(given):
+                        mixed[2, i, j] += given[m, q, i, j]
+                    stress[q, i, j] = d * g[q, i, j]
             for p in range(6):
                 i, k = FIRST[p], SECOND[p]
                 for n in range(3):
-                    c0 = w * (tangent[i, 0, k, n] + push * (g[q, i, 0] * g[q, k, n] - g[q, i, n] * g[q, k, 0]))
-                    c1 = w * (tangent[i, 1, k, n] + push * (g[q, i, 1] * g[q, k, n] - g[q, i, n] * g[q, k, 1]))
-                    c2 = w * (tangent[i, 2, k, n] + push * (g[q, i, 2] * g[q, k, n] - g[q, i, n] * g[q, k, 2]))
-                    if len(given) and i == k:
-                        c0 += w * given[m, q, 0, n]
-                        c1 += w * given[m, q, 1, n]
-                        c2 += w * given[m, q, 2, n]
-                    row = left[3 * q + n]
+                    for j in range(3):
+                        c = bend * f[q, i, j] * f[q, k, n] + mixed[0, i, j] * g[q, k, n] + g[q, i, j] * mixed[0, k, n]
+                        c += mixed[1, i, n] * g[q, k, j] + g[q, i, n] * mixed[1, k, j] + 2 * c01 * second[0, i, k] * second[1, j, n]
+                        mixed[3, n, j] = w * (c + mixed[2, j, n] if i == k else c)
+                for n in range(3):
+                    c0, c1, c2 = mixed[3, n, 0], mixed[3, n, 1], mixed[3, n, 2]
                     for a in range(count):
-                        row[count * p + a] = c0 * grad[3 * q, a] + c1 * grad[3 * q + 1, a] + c2 * grad[3 * q + 2, a]
-            for i in range(3):
-                s0, s1, s2 = w * det[q] * g[q, i, 0], w * det[q] * g[q, i, 1], w * det[q] * g[q, i, 2]
+                        left[3 * q + n, count * p + a] = (
+                            c0 * gradients[m, q, 0, a] + c1 * gradients[m, q, 1, a] + c2 * gradients[m, q, 2, a]
+                        )
+        for q in range(8):
+            w, level = weights[m, q], q // 4
+            s00, s01, s02 = w * stress[q, 0, 0], w * stress[q, 0, 1], w * stress[q, 0, 2]
+            s10, s11, s12 = w * stress[q, 1, 0], w * stress[q, 1, 1], w * stress[q, 1, 2]
+            s20, s21, s22 = w * stress[q, 2, 0], w * stress[q, 2, 1], w * stress[q, 2, 2]
+            for a in range(count):
+                g0, g1, g2 = gradients[m, q, 0, a], gradients[m, q, 1, a], gradients[m, q, 2, a]
+                push[level, 0, a] += s00 * g0 + s01 * g1 + s02 * g2
+                push[level, 1, a] += s10 * g0 + s11 * g1 + s12 * g2
+                push[level, 2, a] += s20 * g0 + s21 * g1 + s22 * g2
+        if stiff:
+            m00, m01, m11 = law[4] + law[5] * lean0**2, law[4] + law[5] * lean0 * lean1, law[4] + law[5] * lean1**2
+            for row in range(24):
                 for a in range(count):
-                    s = s0 * grad[3 * q, a] + s1 * grad[3 * q + 1, a] + s2 * grad[3 * q + 2, a]
-                    swell[0, i, a] += s
-                    swell[1, i, a] += s * lean
-        for row_number in range(24):
-            for a in range(count):
-                right[row_number, a] = grad[row_number, a]
-        np.dot(left.T, right, product)
-        scale[0], scale[1] = law[4] / rest, law[5] / rest
-        for p in range(6):
-            for a in range(count):
-                size, lean_size = scale[0] * swell[0, FIRST[p], a], scale[1] * swell[1, FIRST[p], a]
-                for b in range(count):
-                    out[m, p, a, b] = product[count * p + a, b] + size * swell[0, SECOND[p], b] + lean_size * swell[1, SECOND[p], b]
+                    right[row, a] = gradients[m, row // 3, row % 3, a]
+            for p in range(6):
+                i, k = FIRST[p], SECOND[p]
+                for a in range(count):
+                    left[24 + k, count * p + a] = (m00 * push[0, i, a] + m01 * push[1, i, a]) / rest
+                    left[27 + k, count * p + a] = (m01 * push[0, i, a] + m11 * push[1, i, a]) / rest
+        for a in range(count):
+            for i in range(3):
+                if stiff:
+                    right[24 + i, a], right[27 + i, a] = push[0, i, a], push[1, i, a]
+                else:
+                    force[elements[m, a], i] += push[0, i, a] + push[1, i, a]
+                push[0, i, a] = push[1, i, a] = 0.0
+        if stiff:
+            np.dot(left.T, right, blocks[m])
+    return energy

@@ -320,32 +320,30 @@ def _surface(solid: Solid, control_mm: FloatArray) -> tuple[FloatArray, FloatArr
     return place, np.stack([along_u, along_v, normal], axis=2)
 
 
-@compiled()
 def rotations(matrices: FloatArray) -> FloatArray:
     """The rotations (k, 3, 3) of the polar decompositions of matrices (k, 3, 3) of positive determinant.
 
     They are computed by Newton's iteration R -> (R + R^-T) / 2 (Higham 1986), which converges quadratically.
     """
-    out = np.empty_like(matrices)
-    cofactor = np.zeros((3, 3))
-    for k in range(len(matrices)):
-        r = out[k]
-        for i in range(3):
-            for a in range(3):
-                r[i, a] = matrices[k, i, a]
+    _orthogonalise(out := np.array(matrices, order="C"), np.empty((3, 3)))
+    return out
+
+
+@compiled()
+def _orthogonalise(r: FloatArray, cofactor: FloatArray) -> None:
+    for k in range(len(r)):
         for _ in range(_MOST_POLAR_ITERATIONS):
             for i in range(3):
                 j, m = (i + 1) % 3, (i + 2) % 3
                 for a in range(3):
                     b, c = (a + 1) % 3, (a + 2) % 3
-                    cofactor[i, a] = r[j, b] * r[m, c] - r[j, c] * r[m, b]
-            det = r[0, 0] * cofactor[0, 0] + r[0, 1] * cofactor[0, 1] + r[0, 2] * cofactor[0, 2]
+                    cofactor[i, a] = r[k, j, b] * r[k, m, c] - r[k, j, c] * r[k, m, b]
+            det = r[k, 0, 0] * cofactor[0, 0] + r[k, 0, 1] * cofactor[0, 1] + r[k, 0, 2] * cofactor[0, 2]
             change = 0.0
             for i in range(3):
                 for a in range(3):
-                    new = (r[i, a] + cofactor[i, a] / det) / 2
-                    change = max(change, abs(new - r[i, a]))
-                    r[i, a] = new
+                    new = (r[k, i, a] + cofactor[i, a] / det) / 2
+                    change = max(change, abs(new - r[k, i, a]))
+                    r[k, i, a] = new
             if change < _POLAR_CHANGE:
                 break
-    return out

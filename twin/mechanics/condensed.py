@@ -269,9 +269,9 @@ class SmallContact:
         """Factorise the matrix of Newton's method, in single precision: that halves the cost and does not harm the convergence."""
         problem, local, count = self._problem, self._near.local, len(self._near.near)
         turn = problem.T[:3, :3]
-        stiffness = turn @ contact.stiffness @ turn.T
+        stiffness = (contact.stiffness.reshape(-1, 9) @ np.kron(turn, turn).T).reshape(-1, 3, 3)  # R K R^T of each point
         matrix = np.zeros((count + 2, count + 2), np.float32, order="F")
-        matrix[:count, :count] = self._near.matrix
+        matrix[:count, :count] = self._near.matrix.T
         spread_stiffness(local, problem.weights, stiffness, matrix)
         matrix[count, count] = matrix[count + 1, count + 1] = 1.0
         if problem.compliance:  # a displacement w of the object along z acts like a displacement -w of all points

@@ -106,15 +106,18 @@ def touching_mm2(points: ContactPoints, gap_mm: FloatArray) -> float:
     return float(np.clip(0.5 + (TOUCHING_MM - gap_mm) / change, 0, 1) @ points.area_mm2)
 
 
-@compiled()
 def positions(controls: IntArray, weights: FloatArray, lift: FloatArray, control: FloatArray) -> FloatArray:
     """Positions (p, 3) of points that are carried by nine controls each."""
-    out = lift.copy()
+    _carry(controls, weights, control, out := lift.copy())
+    return out
+
+
+@compiled()
+def _carry(controls: IntArray, weights: FloatArray, control: FloatArray, out: FloatArray) -> None:
     for p in range(len(controls)):
         for a in range(9):
             for i in range(3):
                 out[p, i] += weights[p, a] * control[controls[p, a], i]
-    return out
 
 
 @dataclass(frozen=True)

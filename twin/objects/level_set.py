@@ -44,7 +44,7 @@ class Wrapped(ObjectField):
         """
         slopes = np.zeros((len(points_mm), 2, 3))
         slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0
-        return points_mm[:, :2].copy(), slopes, np.zeros((len(points_mm), 2, 3, 3))
+        return rows(points_mm)[:, :2].copy(), slopes, np.zeros((len(points_mm), 2, 3, 3))
 
 
 def rows(points_mm: FloatArray) -> FloatArray:
@@ -62,16 +62,16 @@ def unit_normals(slope: FloatArray, hessian: FloatArray) -> None:
     for k in range(len(slope)):
         size = np.sqrt(slope[k, 0] ** 2 + slope[k, 1] ** 2 + slope[k, 2] ** 2)
         if size < _FLAT:
-            slope[k], slope[k, 2], hessian[k] = 0.0, -1.0, 0.0
+            for i in range(3):
+                slope[k, i] = -1.0 if i == 2 else 0.0
+                for j in range(3):
+                    hessian[k, i, j] = 0.0
             continue
-        x, y, z = slope[k, 0] / size, slope[k, 1] / size, slope[k, 2] / size
-        h = hessian[k]
-        hx = h[0, 0] * x + h[0, 1] * y + h[0, 2] * z
-        hy = h[1, 0] * x + h[1, 1] * y + h[1, 2] * z
-        hz = h[2, 0] * x + h[2, 1] * y + h[2, 2] * z
-        along = hx * x + hy * y + hz * z
-        n, bent = (x, y, z), (hx, hy, hz)
+        n, along = (slope[k, 0] / size, slope[k, 1] / size, slope[k, 2] / size), 0.0
         for i in range(3):
-            slope[k, i] = n[i]
+            slope[k, i] = hessian[k, i, 0] * n[0] + hessian[k, i, 1] * n[1] + hessian[k, i, 2] * n[2]  # H n for now
+            along += slope[k, i] * n[i]
+        for i in range(3):
             for j in range(3):
-                h[i, j] = (h[i, j] - (bent[i] * n[j] + bent[j] * n[i]) + along * (n[i] * n[j])) / size
+                hessian[k, i, j] = (hessian[k, i, j] - (slope[k, i] * n[j] + slope[k, j] * n[i]) + along * (n[i] * n[j])) / size
+        slope[k, 0], slope[k, 1], slope[k, 2] = n

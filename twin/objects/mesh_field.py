@@ -71,10 +71,15 @@ def _step_in(point: float, low: float, spacing: float, count: int) -> tuple[int,
 
 @compiled(error_model="numpy", fastmath=_SUMS)
 def spline_probe(
-    coefficients: FloatArray, corner: FloatArray, spacing: float, points: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Values (k,), slopes (k, 3) and second derivatives (k, 3, 3) at points (k, 3). Outside the grid the distance to it is added."""
-    value, slope, hessian = np.empty(len(points)), np.empty((len(points), 3)), np.empty((len(points), 3, 3))
+    coefficients: FloatArray,
+    corner: FloatArray,
+    spacing: float,
+    points: FloatArray,
+    value: FloatArray,
+    slope: FloatArray,
+    hessian: FloatArray,
+) -> None:
+    """Write values (k,), slopes (k, 3) and second derivatives (k, 3, 3) at points (k, 3). Outside the grid the distance to it is added."""
     counts, per_mm = coefficients.shape, 1 / spacing
     for k in range(len(points)):
         i, tx, away_x = _step_in(points[k, 0], corner[0], spacing, counts[0])
@@ -102,26 +107,16 @@ def spline_probe(
         hessian[k, 0, 2] = hessian[k, 2, 0] = fxz * square
         hessian[k, 1, 2] = hessian[k, 2, 1] = fyz * square
         if away_x != 0 or away_y != 0 or away_z != 0:
-            value[k] += _add_gap(slope[k], hessian[k], (away_x, away_y, away_z))
-    return value, slope, hessian
-
-
-@compiled(error_model="numpy", fastmath=_SUMS)
-def _add_gap(slope: FloatArray, hessian: FloatArray, away: tuple[float, float, float]) -> float:
-    """Change slope and Hessian of a point outside the grid, by ``away`` along each axis, in place; returns the distance to the grid.
-
-    Outside the grid the spline is constant along these axes, and the distance to the grid is added to it.
-    """
-    gap = np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2)
-    for i in range(3):
-        if away[i] != 0:
-            slope[i] = away[i] / gap
-        for j in range(3):
-            if away[i] != 0 and away[j] != 0:
-                hessian[i, j] = ((i == j) - away[i] * away[j] / gap**2) / gap
-            elif away[i] != 0 or away[j] != 0:
-                hessian[i, j] = 0.0
-    return gap
+            away, gap = (away_x, away_y, away_z), np.sqrt(away_x**2 + away_y**2 + away_z**2)
+            value[k] += gap
+            for n in range(3):  # outside the grid the spline is constant along these axes
+                if away[n] != 0:
+                    slope[k, n] = away[n] / gap
+                for c in range(3):
+                    if away[n] != 0 and away[c] != 0:
+                        hessian[k, n, c] = ((n == c) - away[n] * away[c] / gap**2) / gap
+                    elif away[n] != 0 or away[c] != 0:
+                        hessian[k, n, c] = 0.0
 
 
 @dataclass(frozen=True)
@@ -145,9 +140,10 @@ class MeshField(Wrapped):
     coefficients: FloatArray
 
     def probe(self, points_mm: FloatArray) -> Probe:
-        distance, slope, hessian = spline_probe(self.coefficients, self.corner_mm, self.spacing_mm, rows(points_mm))
-        unit_normals(slope, hessian)
-        return distance, slope, hessian
+        found = np.empty(len(points_mm)), np.empty((len(points_mm), 3)), np.empty((len(points_mm), 3, 3))
+        spline_probe(self.coefficients, self.corner_mm, self.spacing_mm, rows(points_mm), *found)
+        unit_normals(*found[1:])
+        return found
 
 
 def load_mesh_field(shape: MeshShape) -> MeshField:

@@ -102,8 +102,8 @@ def draw_pins(
     """
     xy = np.ascontiguousarray(np.moveaxis(outlines, -1, 0))
     bodies = xy[:, :, 0], xy[:, :, 1:].reshape(*xy.shape[:2], -1)
-    low, high = (np.moveaxis([reduce(body, axis=2) for body in bodies], 1, -1) for reduce in (np.min, np.max))  # (2, N, 2)
-    drawn = ((high > -0.5) & (low < np.array(image.shape[1::-1]) - 0.5)).all(axis=2)
+    low, high = (np.moveaxis(np.array([reduce(body, axis=2) for body in bodies]), 1, -1) for reduce in (np.min, np.max))  # (2, N, 2)
+    drawn: BoolArray = np.all((high > -0.5) & (low < np.array(image.shape[1::-1]) - 0.5), axis=2)
     low, high = np.where(drawn[..., None], [low, high], 0.0)
     # two additional columns take what an edge adds beyond the last pixel; the last channel is the covered share
     first = np.floor(low + 0.5).astype(int)

@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -288,6 +287,8 @@ def _drift_labelling(
 
 def _assign_drifted(places: np.ndarray, blobs: np.ndarray) -> np.ndarray:
     """Blob (N,) of each pin, -1 for none: as many pairs within reach as possible, the nearest of all."""
+    from scipy.optimize import linear_sum_assignment  # takes a tenth of a second, and few frames need it
+
     share2 = ((blobs - places[:, None]) ** 2).sum(axis=2) / DRIFT_REACH**2
     pins, chosen = linear_sum_assignment(np.minimum(share2, 1.0))
     found = np.full(len(places), -1)
@@ -501,8 +502,7 @@ def _grow(layout: LayoutArrays, blobs: FrameBlobs, start: np.ndarray) -> np.ndar
     blob, count = start.copy(), len(blobs.px)
     moved, weight, taken = blobs.px[blob], (blob >= 0).astype(float), np.zeros(count, bool)
     taken[blob[blob >= 0]] = True
-    numbers = np.empty((2, count), int)
-    _grow_onward(layout, blobs, blob, moved, weight, taken, numbers, np.empty((2, count)), np.empty(len(blob), int))
+    _grow_onward(layout, blobs, blob, moved, weight, taken, np.empty((2, count), int), np.empty((2, count)), np.empty(len(blob), int))
     return blob
 
 
@@ -661,6 +661,8 @@ def _assign(n: int, blob_count: int, pins: np.ndarray, blobs: np.ndarray, costs:
     blob[pins[~open_pair]] = blobs[~open_pair]
     if not open_pair.any():
         return blob
+    from scipy.optimize import linear_sum_assignment  # takes a tenth of a second, and few frames need it
+
     row_pin, row = np.unique(pins[open_pair], return_inverse=True)
     column_blob, column = np.unique(blobs[open_pair], return_inverse=True)
     table = np.full((len(row_pin), len(column_blob)), NO_PAIR_COST)

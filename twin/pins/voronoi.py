@@ -102,7 +102,7 @@ def net_of(triangles: np.ndarray, n: int) -> Net | None:
     return Net(whole, np.array(beyond))
 
 
-@compiled(error_model="numpy")
+@compiled()
 def _flip(px: np.ndarray, triangles: np.ndarray, beyond: np.ndarray, due: np.ndarray) -> int:
     """Make a net Delaunay by flips, in its triangles and neighbours (t, 3), and count them: -1 if that is not possible.
 

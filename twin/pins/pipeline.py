@@ -344,8 +344,7 @@ class Pipeline:
         extra = 0
         if len(extra_px):
             center = nodes_px.mean(axis=0)
-            radius = np.linalg.norm(nodes_px - center, axis=1).max()
-            extra = int((np.linalg.norm(extra_px - center, axis=1) < radius).sum())
+            extra = int((np.linalg.norm(extra_px - center, axis=1) < np.linalg.norm(nodes_px - center, axis=1).max()).sum())
         if extra > n or (extra > MAX_EXTRA * n and found < NEARLY_ALL * n):
             return f"too many blobs: {extra} among the {found} pins found; another sensor's frame, or clutter"
         rim = self.reference.outmost[~self._cut_off(nodes_px)[self.reference.outmost]]
@@ -413,8 +412,7 @@ def share_between(gray: np.ndarray, pins_px: np.ndarray, near: np.ndarray, darke
     above = np.sort(above[np.isfinite(above)])
     if not len(above):
         return 0.0
-    low, part = divmod((len(above) - 1) * (bright / 100), 1)
-    level = above[int(low)] + part * (above[min(int(low) + 1, len(above) - 1)] - above[int(low)])  # as np.percentile, which is slow
+    level = np.interp((len(above) - 1) * (bright / 100), np.arange(len(above)), above)  # as np.percentile, in a tenth of its time
     return float(np.count_nonzero(above <= LEAST_ABOVE * level) / len(above))
 
 

@@ -102,7 +102,7 @@ def net_of(triangles: np.ndarray, n: int) -> Net | None:
     return Net(whole, np.array(beyond))
 
 
-@compiled(error_model="numpy")
+@compiled()
 def _flip(px: np.ndarray, triangles: np.ndarray, beyond: np.ndarray, due: np.ndarray) -> int:
     """Make a net Delaunay by flips, in its triangles and neighbours (t, 3), and count them: -1 if that is not possible.
 
@@ -231,7 +231,6 @@ def _cut(
     region itself. Corners that are too many for their array are only counted.
     """
     for i in range(len(area)):
-        count, now, inside = 0, 0, False
         for attempt in range(2):
             count, now = 4 if attempt == 0 else len(outlines) - 4, 0
             for k in range(count):
@@ -262,8 +261,7 @@ def _cut(
                 inside = inside and (work[now, k, 0] - disc[0]) ** 2 + (work[now, k, 1] - disc[1]) ** 2 < disc[2] ** 2
             if inside:
                 break
-        total = 0.0  # relative to the first corner, which avoids cancellation of digits
-        x, y = work[now, 0, 0], work[now, 0, 1]
+        total, x, y = 0.0, work[now, 0, 0], work[now, 0, 1]  # relative to the first corner, which avoids cancellation of digits
         for k in range(1, count - 1):
             total += (work[now, k, 0] - x) * (work[now, k + 1, 1] - y) - (work[now, k + 1, 0] - x) * (work[now, k, 1] - y)
         area[i] = 0.5 * total
@@ -278,9 +276,8 @@ def _tile(nodes: np.ndarray, start: np.ndarray, neighbours: np.ndarray, region: 
     n, m = len(nodes), len(region)
     x, y = region.mean(axis=0).tolist()
     radius = WITHIN * cv2.pointPolygonTest(region.astype(np.float32), (x, y), measureDist=True)
-    outlines = np.empty((m + 4, 2))
-    outlines[:4], outlines[4:] = region.min(axis=0), region
-    outlines[1:3, 0], outlines[2:4, 1] = region.max(axis=0)
+    (left, top), (right, bottom) = region.min(axis=0), region.max(axis=0)
+    outlines = np.concatenate([[(left, top), (right, top), (right, bottom), (left, bottom)], region])
     area, first, corners = np.empty(n), np.zeros(n + 1, np.int64), np.empty((16 * n + 4 * m, 2))
     disc, work = np.array([x, y, radius]), np.empty((2, 2 * m + 2 * n + 8, 2))
     _cut(nodes, start, neighbours, outlines, disc, work, area, first, corners)

@@ -17,7 +17,6 @@ from typing import Protocol
 import cv2
 import numpy as np
 from scipy.spatial import ConvexHull, Delaunay, QhullError, Voronoi, cKDTree
-from skimage.feature import blob_dog, blob_doh, blob_log
 
 from scenes.pins import PinsSpec
 from scenes.sensor import RecordingSpec, SensorSpec
@@ -356,6 +355,8 @@ def _simple(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.
 
 def _scale_space(window: np.ndarray, mask: Mask, detector: DetectorSpec) -> tuple[np.ndarray, np.ndarray]:
     """scikit-image's Laplacian or difference of Gaussians, or determinant of Hessian."""
+    from skimage.feature import blob_dog, blob_doh, blob_log  # takes a tenth of a second, and other methods need none
+
     contrast = detector.blob.threshold / LEVELS
     small, large = (radius / np.sqrt(2) for radius in detector.radius_px)
     inside = mask.disc > 0

@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -109,18 +108,12 @@ at most 0.13, a torn picture 0.18."""
 
 
 class LayoutArrays(NamedTuple):
-    """The reference's arrays that matching needs: rest (N, 2) px, neighbours (N, k), spacing (N,) px, slots (S,), ring_ends (R + 1,).
-
-    ``beside`` (N, k, 3) are the neighbours' x and y from the pin, in its spacings, and their weights 1 / (0.5 + x^2 + y^2).
-    Ring i's pins are ``slots[ring_ends[i - 1]:ring_ends[i]]``, in order around the layout, -1 where one is missing.
-    """
+    """The reference's arrays that kernels need: rest (N, 2) px, neighbours (N, k), beside (N, k, 3), spacing (N,) px."""
 
     rest: np.ndarray
     neighbours: np.ndarray
     beside: np.ndarray
     spacing: np.ndarray
-    slots: np.ndarray
-    ring_ends: np.ndarray
 
 
 class FrameBlobs(NamedTuple):
@@ -215,7 +208,7 @@ def find_again(reference: Reference, px: np.ndarray, area_px2: np.ndarray, befor
     """A labelling ``before`` of blobs at places (M, 2) for the blobs (K, 2) that another look at the same frame shows: it grows onward."""
     layout, blobs = _layout(reference), _put_in_cells(reference, px, area_px2)
     names = _carry_names(layout, np.where(before.blob[:, None] >= 0, before_px[before.blob], np.nan), blobs)
-    return replace(_refine(layout, blobs, _grow(layout, blobs, names)), lead=before.lead)
+    return replace(_refine(reference, blobs, _grow(layout, blobs, names)), lead=before.lead)
 
 
 def _carry_names(layout: LayoutArrays, before_px: np.ndarray, blobs: FrameBlobs) -> np.ndarray:
@@ -294,6 +287,8 @@ def _drift_labelling(
 
 def _assign_drifted(places: np.ndarray, blobs: np.ndarray) -> np.ndarray:
     """Blob (N,) of each pin, -1 for none: as many pairs within reach as possible, the nearest of all."""
+    from scipy.optimize import linear_sum_assignment  # takes a tenth of a second, and few frames need it
+
     share2 = ((blobs - places[:, None]) ** 2).sum(axis=2) / DRIFT_REACH**2
     pins, chosen = linear_sum_assignment(np.minimum(share2, 1.0))
     found = np.full(len(places), -1)
@@ -318,12 +313,12 @@ def _grow_labelling(reference: Reference, px: np.ndarray, area_px2: np.ndarray) 
         start = np.full(n, -1)
         start[pin] = blob
         labels = _grow(layout, blobs, start)
-        unwound = _unwound(layout, blobs.px, labels)
+        unwound = _unwound(reference, blobs.px, labels)
         if (unwound >= 0).any() and not np.array_equal(unwound, labels):
             labels = _grow(layout, blobs, unwound)
         count = int((labels >= 0).sum())
         if count >= NEARLY_ALL * n or (count >= NEARLY_ALL**2 * len(px) and count > MIN_SETTLED * n):
-            found = _refine(layout, blobs, labels)
+            found = _refine(reference, blobs, labels)
             away = _rim_displacement(reference, px, found.blob)
             settled = found.score >= SETTLED * count and (count >= NEARLY_ALL * n or away < NEAR_REST)
             if settled or (away < HARDLY_MOVED and (found.blob >= 0).sum() == len(px) == n and proven(reference, px, found.blob)):
@@ -334,7 +329,7 @@ def _grow_labelling(reference: Reference, px: np.ndarray, area_px2: np.ndarray) 
             large.append(labels)
     if best is None:
         likely = sorted(grown.values(), key=lambda labels: -int((labels >= 0).sum()))[:REFINED]
-        best = _leading(reference, px, [_refine(layout, blobs, labels) for labels in likely])
+        best = _leading(reference, px, [_refine(reference, blobs, labels) for labels in likely])
         if best.score < nothing.score:
             return nothing
     return best
@@ -367,7 +362,7 @@ def rematch(reference: Reference, px: np.ndarray, area_px2: np.ndarray, blob: np
     """Refine a labelling ``blob`` (N,) of nearly all pins for a slightly different set of blobs, in the way that ``match`` found it."""
     if found is not None and found.drifted:
         return look_again(reference, px, area_px2, replace(found, blob=np.full(len(blob), -1)))
-    return _refine(_layout(reference), _put_in_cells(reference, px, area_px2), blob)
+    return _refine(reference, _put_in_cells(reference, px, area_px2), blob)
 
 
 def confirm(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: Match) -> Match:
@@ -384,7 +379,7 @@ def confirm(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: M
     if main[blob >= 0].all():
         return found
     layout, blobs = _layout(reference), _put_in_cells(reference, px, area_px2)
-    again = _refine(layout, blobs, _grow(layout, blobs, np.where(main, blob, -1)))
+    again = _refine(reference, blobs, _grow(layout, blobs, np.where(main, blob, -1)))
     across = (blob >= 0) & (again.blob < 0) & ~np.isin(blob, again.blob)
     if across.any():
         nodes_px = complete(reference, np.where(again.blob[:, None] >= 0, px[again.blob], np.nan))
@@ -395,7 +390,7 @@ def confirm(reference: Reference, px: np.ndarray, area_px2: np.ndarray, found: M
             pins = np.flatnonzero(across & (part == one))
             if np.median(away[pins[np.argsort(gap[pins])[:NEAR]]]) < FINAL_GATE:
                 start[pins] = blob[pins]
-        again = _refine(layout, blobs, start)
+        again = _refine(reference, blobs, start)
     renamed = (again.blob != blob) & (again.blob >= 0) & (blob >= 0)
     return replace(again, lead=0.0 if renamed.any() and again.score <= found.score else found.lead)
 
@@ -431,9 +426,7 @@ def complete(reference: Reference, pins_px: np.ndarray) -> np.ndarray:
 
 
 @compiled(error_model="numpy")
-def predict(
-    i: int, rest: np.ndarray, neighbours: np.ndarray, beside: np.ndarray, moved: np.ndarray, weight: np.ndarray
-) -> tuple[float, float, int]:
+def predict(i: int, layout: LayoutArrays, moved: np.ndarray, weight: np.ndarray) -> tuple[float, float, int]:
     """Displacement of pin ``i`` as predicted from its neighbours alone, and the number of neighbours that were used.
 
     u(x) = a + G (x - x_i) is fitted by weighted least squares to the neighbours with ``weight`` > 0. A small penalty of the gradient G
@@ -442,8 +435,7 @@ def predict(
     Parameters
     ----------
     i : int
-    rest, neighbours, beside : array
-        See ``LayoutArrays``.
+    layout : LayoutArrays
     moved : (N, 2) float
         Current positions, px.
     weight : (N,) float
@@ -455,6 +447,7 @@ def predict(
         Displacement, px.
     count : int
     """
+    rest, neighbours, beside = layout.rest, layout.neighbours, layout.beside
     m00 = m01 = m02 = 0.0
     m11 = m22 = RIDGE
     m12 = 0.0
@@ -491,16 +484,15 @@ def predict(
 def predict_all(layout: LayoutArrays, moved: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Each pin's position (N, 2) as predicted from its neighbours; NaN if no neighbour has a weight."""
     out = np.empty_like(moved)
-    _predict_each(layout.rest, layout.neighbours, layout.beside, moved, weight, out)
+    _predict_each(layout, moved, weight, out)
     return out
 
 
 @compiled(error_model="numpy")
-def _predict_each(
-    rest: np.ndarray, neighbours: np.ndarray, beside: np.ndarray, moved: np.ndarray, weight: np.ndarray, out: np.ndarray
-) -> None:
+def _predict_each(layout: LayoutArrays, moved: np.ndarray, weight: np.ndarray, out: np.ndarray) -> None:
+    rest = layout.rest
     for i in range(len(rest)):
-        ux, uy, count = predict(i, rest, neighbours, beside, moved, weight)
+        ux, uy, count = predict(i, layout, moved, weight)
         out[i, 0] = rest[i, 0] + ux if count else np.nan
         out[i, 1] = rest[i, 1] + uy if count else np.nan
 
@@ -510,18 +502,13 @@ def _grow(layout: LayoutArrays, blobs: FrameBlobs, start: np.ndarray) -> np.ndar
     blob, count = start.copy(), len(blobs.px)
     moved, weight, taken = blobs.px[blob], (blob >= 0).astype(float), np.zeros(count, bool)
     taken[blob[blob >= 0]] = True
-    numbers = np.empty((2, count), int)
-    known = layout.rest, layout.neighbours, layout.beside, layout.spacing
-    _grow_onward(*known, blobs, blob, moved, weight, taken, numbers, np.empty((2, count)), np.empty(len(blob), int))
+    _grow_onward(layout, blobs, blob, moved, weight, taken, np.empty((2, count), int), np.empty((2, count)), np.empty(len(blob), int))
     return blob
 
 
 @compiled(error_model="numpy")
 def _grow_onward(
-    rest: np.ndarray,
-    neighbours: np.ndarray,
-    beside: np.ndarray,
-    spacing: np.ndarray,
+    layout: LayoutArrays,
     blobs: FrameBlobs,
     blob: np.ndarray,
     moved: np.ndarray,
@@ -535,9 +522,8 @@ def _grow_onward(
 
     ``numbers`` and ``squares`` (2, K) are for work, and so is ``tried`` (N,): number of labelled neighbours when a pin was last tried.
     """
-    near = min(6, neighbours.shape[1])
-    claim, found = numbers[0], numbers[1]
-    claim_cost, away2 = squares[0], squares[1]
+    rest, neighbours, spacing, near = layout.rest, layout.neighbours, layout.spacing, min(6, layout.neighbours.shape[1])
+    claim, found, claim_cost, away2 = numbers[0], numbers[1], squares[0], squares[1]
     labelled = 0
     for i in range(len(blob)):
         labelled += blob[i] >= 0
@@ -555,7 +541,7 @@ def _grow_onward(
                     touching = touching or blob[neighbours[i, k]] >= 0
                 if blob[i] >= 0 or not touching:
                     continue
-                ux, uy, count = predict(i, rest, neighbours, beside, moved, weight)
+                ux, uy, count = predict(i, layout, moved, weight)
                 if count == tried[i] or count < min(3 - level, labelled):
                     continue
                 tried[i] = count
@@ -580,7 +566,10 @@ def _grow_onward(
 def _turn_rings(
     rest: np.ndarray, slots: np.ndarray, ring_ends: np.ndarray, px: np.ndarray, blob: np.ndarray, least: int, turns: np.ndarray
 ) -> None:
-    """Turn of each ring as a unit vector, 0 if unknown, after its labels are shifted back by ``least`` or more pins: (W, R, 2)."""
+    """Turn of each ring as a unit vector, 0 if unknown, after its labels are shifted back by ``least`` or more pins: (W, R, 2).
+
+    Ring i's pins are ``slots[ring_ends[i]:ring_ends[i + 1]]``, in order around the layout, -1 where one is missing.
+    """
     for w in range(len(turns)):
         for ring in range(len(ring_ends) - 1):
             first, size = ring_ends[ring], ring_ends[ring + 1] - ring_ends[ring]
@@ -600,23 +589,23 @@ def _turn_rings(
                     turns[w, ring, 0], turns[w, ring, 1] = along / length, across / length
 
 
-def _ring_turns(layout: LayoutArrays, px: np.ndarray, blob: np.ndarray, most: int) -> np.ndarray:
+def _ring_turns(reference: Reference, px: np.ndarray, blob: np.ndarray, most: int) -> np.ndarray:
     """Turns (2 most + 1, R) of the rings as unit complex numbers, 0 if unknown, after their labels are shifted by up to ``most`` pins."""
-    turns = np.zeros((2 * most + 1, len(layout.ring_ends) - 1, 2))
-    _turn_rings(layout.rest, layout.slots, layout.ring_ends, px, blob, -most, turns)
+    turns = np.zeros((2 * most + 1, len(reference.ring_ends) - 1, 2))
+    _turn_rings(reference.pins_px, reference.slots, reference.ring_ends, px, blob, -most, turns)
     return turns.view(complex)[..., 0]
 
 
-def _unwound(layout: LayoutArrays, px: np.ndarray, blob: np.ndarray) -> np.ndarray:
+def _unwound(reference: Reference, px: np.ndarray, blob: np.ndarray) -> np.ndarray:
     """A labelling (N,) whose rings are shifted back by the number of pins with which they turn most alike.
 
     If anything is shifted, the innermost rings lose their labels.
     """
-    alike = np.abs(_ring_turns(layout, px, blob, MAX_WINDING)[:, BROKEN_RINGS:].sum(axis=1))
+    alike = np.abs(_ring_turns(reference, px, blob, MAX_WINDING)[:, BROKEN_RINGS:].sum(axis=1))
     if alike[MAX_WINDING] == alike.max():
         return blob
     out = np.full(len(blob), -1)
-    for ring in np.split(layout.slots, layout.ring_ends[1:-1])[BROKEN_RINGS:]:
+    for ring in np.split(reference.slots, reference.ring_ends[1:-1])[BROKEN_RINGS:]:
         source = np.roll(ring, alike.argmax() - MAX_WINDING)
         both = (ring >= 0) & (source >= 0)
         out[ring[both]] = blob[source[both]]
@@ -630,9 +619,7 @@ def _trust(layout: LayoutArrays, px: np.ndarray, blob: np.ndarray) -> tuple[np.n
     return moved, np.fmax(weight / (1 + away2 / (SOFT_RESIDUAL * layout.spacing) ** 2), 0.0)  # 0 without a prediction
 
 
-def _candidates(
-    layout: LayoutArrays, blobs: FrameBlobs, predicted: np.ndarray, blob: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _candidates(layout: LayoutArrays, blobs: FrameBlobs, predicted: np.ndarray, blob: np.ndarray) -> tuple[np.ndarray, ...]:
     """Possible pairs within the gate: pins, blobs and costs (p,)."""
     pins, near, away2 = _pairs(predicted, FINAL_GATE * layout.spacing, blobs)
     known, each = (blob >= 0).astype(float), np.ones(layout.neighbours.shape[1])
@@ -674,6 +661,8 @@ def _assign(n: int, blob_count: int, pins: np.ndarray, blobs: np.ndarray, costs:
     blob[pins[~open_pair]] = blobs[~open_pair]
     if not open_pair.any():
         return blob
+    from scipy.optimize import linear_sum_assignment  # takes a tenth of a second, and few frames need it
+
     row_pin, row = np.unique(pins[open_pair], return_inverse=True)
     column_blob, column = np.unique(blobs[open_pair], return_inverse=True)
     table = np.full((len(row_pin), len(column_blob)), NO_PAIR_COST)
@@ -684,9 +673,9 @@ def _assign(n: int, blob_count: int, pins: np.ndarray, blobs: np.ndarray, costs:
     return blob
 
 
-def _refine(layout: LayoutArrays, blobs: FrameBlobs, blob: np.ndarray) -> Match:
+def _refine(reference: Reference, blobs: FrameBlobs, blob: np.ndarray) -> Match:
     """Re-assign every pin to the blobs near where its neighbours predict it, until nothing changes."""
-    px = blobs.px
+    layout, px = _layout(reference), blobs.px
     for _ in range(REFINE_ROUNDS):
         predicted = predict_all(layout, *_trust(layout, px, blob))
         before = blob
@@ -696,7 +685,7 @@ def _refine(layout: LayoutArrays, blobs: FrameBlobs, blob: np.ndarray) -> Match:
     blob = _adopt(layout, px, blobs.area, blob, predicted)
     found = blob >= 0
     residual2 = ((px[blob[found]] - predicted[found]) ** 2).sum(axis=1) / (FINAL_GATE * layout.spacing[found]) ** 2
-    turns = _ring_turns(layout, px, blob, 0)[0]
+    turns = _ring_turns(reference, px, blob, 0)[0]
     turned = 1.0 - turns.real.sum() / max(np.count_nonzero(turns), 1)
     return Match(blob, predicted, float(found.sum() - residual2.sum() - TURN_WEIGHT * len(blob) * turned))
 
@@ -748,8 +737,7 @@ def _seeds(reference: Reference, px: np.ndarray) -> Iterator[tuple[int, int]]:
 
 
 def _layout(reference: Reference) -> LayoutArrays:
-    known = reference
-    return LayoutArrays(known.pins_px, known.neighbours, known.beside, known.spacing_px, known.slots, known.ring_ends)
+    return LayoutArrays(reference.pins_px, reference.neighbours, reference.beside, reference.spacing_px)
 
 
 def _put_in_cells(reference: Reference, px: np.ndarray, area_px2: np.ndarray) -> FrameBlobs:

@@ -240,7 +240,7 @@ def count_turned_over(px: np.ndarray, triangles: np.ndarray, known: np.ndarray) 
     """
     if not known.all():
         triangles = triangles[known[triangles].all(axis=1)]
-    return np.count_nonzero(_areas2(px, triangles) <= 0)
+    return int(np.count_nonzero(_areas2(px, triangles) <= 0))
 
 
 def smooth_view(places: np.ndarray, px: np.ndarray) -> np.ndarray:

@@ -96,6 +96,13 @@ def no_assumption_costs(monkeypatch):
 
 
 @pytest.fixture
+def no_other_layout(monkeypatch):
+    """Frames are searched for no layout but the sensor's own, which takes most of a check and a tuning: for tests of something else."""
+    for module in ("twin.pins.check", "twin.pins.detectors.tune"):
+        monkeypatch.setattr(f"{module}.other_layout", lambda layout, images: [])
+
+
+@pytest.fixture
 def undrawn_charts(monkeypatch):
     """Charts of pages are made, but not drawn, which takes seconds: for tests that look at something else of a page."""
     monkeypatch.setattr("twin.report.charts.save_figure", lambda path, figure, **_: write_image(path, np.zeros((8, 8), np.uint8)))

@@ -106,6 +106,7 @@ def test_a_sensor_of_dark_pins_is_made_checked_and_tuned(made):
         tune([Frame(255 - frame.image, Form.RAW) for frame in frames], found.sensor)
 
 
+@pytest.mark.usefixtures("no_other_layout")
 def test_white_skin_around_dark_caps_is_saturated_and_black_caps_are_not(made):
     found, _, _ = made
     images, _ = dots(1, level=(290, 0), light=0.0, corner=0.0)
@@ -182,6 +183,7 @@ def test_pins_at_the_same_place_are_an_error_in_words_not_a_division_by_zero():
         match(make_reference(rest, GRID), rest_of(GRID), np.ones(63))
 
 
+@pytest.mark.usefixtures("no_other_layout")
 def test_a_pin_out_of_view_is_not_put_on_another_one():
     """Two frames that are labelled differently may give an unseen pin the median place at which the frame at rest shows another pin."""
     images = frames_of(rest_of(PinsSpec(rings=4)), 1, contact_px=1e-9)

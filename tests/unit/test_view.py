@@ -220,6 +220,7 @@ def test_pushes_to_known_sides_tell_turn_and_mirror(tmp_path, change, by):
         assert np.nanmax(np.linalg.norm(away, axis=1)) < 0.2 * spacing
 
 
+@pytest.mark.usefixtures("no_other_layout")
 def test_the_written_copy_is_a_sensor_and_wrong_sides_are_refused(tmp_path):
     spec, frames = frames_of("mg400-127", turn_deg=180.0)
     for side, frame in frames.items():
@@ -242,6 +243,7 @@ def test_the_written_copy_is_a_sensor_and_wrong_sides_are_refused(tmp_path):
         registered_view(spec, frames["rest"], {"left": frames["x"], "y": frames["y"]})
 
 
+@pytest.mark.usefixtures("no_other_layout")
 def test_check_names_stretch_and_mirror():
     """The specification holds its unit's own places at rest."""
     spec = model_of("mg400-127").recorded_sensor

@@ -55,6 +55,7 @@ def made(tmp_path_factory):
     return new_sensor(folder, tmp_path / "mine.toml"), rest, folder
 
 
+@pytest.mark.usefixtures("no_other_layout")
 def test_frames_that_a_specification_was_made_from_are_well(made):
     """Also where the picture's border cuts pins off: they are not lost."""
     found, rest, folder = made
@@ -132,6 +133,7 @@ def test_a_tip_of_no_such_size_is_refused(made, tmp_path, radius_mm):
     assert not (tmp_path / "none.toml").exists()
 
 
+@pytest.mark.usefixtures("no_other_layout")
 def test_lengths_that_do_not_belong_to_the_camera_are_found_by_a_check(made):
     """A tip made smaller by hand: pins are still found in frames, and the twin draws another sensor."""
     spec, frames = made[0].sensor, list(open_recording(made[2], made[0].sensor))

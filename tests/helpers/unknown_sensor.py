@@ -33,3 +33,9 @@ def frames_of(rest, count=3, *, size=SIZE, contact_px=4.2, ring=True, level=(20,
 def leave_out_costs(monkeypatch):
     """Make new sensors without the costs of their assumptions."""
     monkeypatch.setattr("twin.calibration.new_sensor.cost_of_assumptions", lambda sensor, *, progress: [])
+
+
+def leave_out_other_layouts(monkeypatch):
+    """Make checks and tunings search frames for no layout but the sensor's own."""
+    for module in ("twin.pins.check", "twin.pins.detectors.tune"):
+        monkeypatch.setattr(f"{module}.other_layout", lambda layout, images: [])

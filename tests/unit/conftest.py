@@ -7,7 +7,7 @@ import pytest
 from drawn_recording import config_of, drawn_dataset
 from filelock import FileLock
 from small_generation import SENSOR, small_config
-from unknown_sensor import leave_out_costs
+from unknown_sensor import leave_out_costs, leave_out_other_layouts
 
 from scenes import load_experiment, load_sensor
 from training.generation import generate
@@ -98,8 +98,7 @@ def no_assumption_costs(monkeypatch):
 @pytest.fixture
 def no_other_layout(monkeypatch):
     """Frames are searched for no layout but the sensor's own, which takes most of a check and a tuning: for tests of something else."""
-    for module in ("twin.pins.check", "twin.pins.detectors.tune"):
-        monkeypatch.setattr(f"{module}.other_layout", lambda layout, images: [])
+    leave_out_other_layouts(monkeypatch)
 
 
 @pytest.fixture

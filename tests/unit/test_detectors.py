@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from drawn_frames import draw_discs, drawn_frame, smooth_warp
+from unknown_sensor import leave_out_other_layouts
 
 from scenes import load_sensor
 from twin.errors import FrameError, OptionError
@@ -58,7 +59,9 @@ def foreign(spec):
 @pytest.fixture(scope="module")
 def tuned_by(spec, foreign):
     """A tuning by each method."""
-    return cache(partial(tune, foreign[0], spec))
+    with pytest.MonkeyPatch.context() as patch:
+        leave_out_other_layouts(patch)
+        yield cache(partial(tune, foreign[0], spec))
 
 
 @pytest.fixture(scope="module")

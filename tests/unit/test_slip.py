@@ -175,6 +175,7 @@ def test_a_run_that_learnt_from_drags_remembers_them_and_its_small_copy_does(con
         assert 0 <= told["slip_begins"] <= 1 and told["slip_left"] >= 0 and -180 <= told["slip_direction"] <= 180
 
 
+@pytest.mark.usefixtures("undrawn_charts")
 def test_slip_of_simulated_drags_is_judged_and_said(contacts, tmp_path):
     folder, run, sensor = contacts
     estimator = PoseEstimator.load(run)

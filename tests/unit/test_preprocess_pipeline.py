@@ -24,11 +24,7 @@ CENTROID_RAW_PX = 0.05  # rms on a drawn gray cap with noise: a tenth of what re
 CENTROID_BINARY_PX = 0.2  # rms of a thresholded cap's centroid: its rim is known to a pixel only
 SAME_PIN_PX = 3.0  # a pin further from its truth carries another pin's name
 
-FORMS = [
-    ("mg400-331", Form.PROCESSED),
-    ("mg400-127", Form.RAW),
-    ("ur5-331", Form.RAW),
-]
+FORMS = [("mg400-331", Form.PROCESSED), ("mg400-127", Form.RAW), ("ur5-331", Form.RAW)]
 
 
 @pytest.fixture(scope="module", params=FORMS, ids=lambda p: f"{p[0]}-{p[1]}")

@@ -302,8 +302,8 @@ def test_real_frames_of_a_displaced_camera_keep_their_estimates(real_dir, folder
             assert made.valid and np.all(np.abs(made.value - before.value) < LIKE_STRAIGHT * (before.high - before.low) / 2), change
     with pytest.raises(FrameError, match="turned by -?180"):
         model.at_rest(warped(recording.reference, centre, turn_deg=180.0))
-    shallow = [k for k, label in enumerate(read_arm_labels(recording)) if 1.5 < label.pose[1] + 5.0 < 1.8][::60][:3]
+    shallow = [k for k, label in enumerate(read_arm_labels(recording)) if 1.5 < label.pose[1] + 5.0 < 1.8][::60][:2]
     for k in shallow:
         with pytest.raises(FrameError, match="seems pressed"):
             model.at_rest(recording.read(k))
-    assert len(shallow) == 3
+    assert len(shallow) == 2

@@ -59,7 +59,7 @@ def plain_eyes(caps_mm, lost, rng):
 def learnt():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(slip, "WAYS", 90)
-        patch.setattr(slip, "EPOCHS", 20)
+        patch.setattr(slip, "EPOCHS", 14)
         rng = np.random.default_rng(0)
         return learn_slip([plain_drag(rng) for _ in range(DRAGS)], plain_eyes, load_sensor("pad-rectangular"))
 

@@ -49,6 +49,7 @@ def test_the_frames_size_does_not_matter(scale):
     assert same(found.best.pins, pins) and found.sure, found.best.line()
 
 
+@pytest.mark.usefixtures("few_sizes")
 def test_a_rim_that_the_frame_cuts_is_told_from_what_is_in_view():
     pins = PinsSpec(rings=6)
     cut = [np.ascontiguousarray(image[33:219, 36:276]) for image in frames_of(rest_of(pins), 2, ring=False)]
@@ -56,6 +57,7 @@ def test_a_rim_that_the_frame_cuts_is_told_from_what_is_in_view():
     assert same(found.best.pins, pins), found.best.line()
 
 
+@pytest.mark.usefixtures("few_sizes")
 @pytest.mark.parametrize(
     ("pins", "part"),
     [
@@ -102,6 +104,7 @@ def test_a_layout_behind_a_round_mask_is_never_sure(share, look):
     assert not found.sure and any("may be cut off" in doubt for doubt in found.doubts)
 
 
+@pytest.mark.usefixtures("few_sizes")
 def test_a_mask_that_shows_the_housing_leaves_the_layout_sure():
     rest = rest_of(PinsSpec(rings=6))
     found = identify(masked(frames_of(rest, 2, contact_px=1.8), rest, 1.3))
@@ -118,6 +121,7 @@ def test_a_layout_whose_pins_fall_together_explains_nothing():
     assert _match_known(pins, rest, [spots])[0].explained == 0.0
 
 
+@pytest.mark.usefixtures("few_sizes")
 def test_a_pin_that_the_rim_lacks_may_be_dark_and_is_not_sure():
     whole = PinsSpec(rings=4)
     found = identify(frames_of(np.delete(rest_of(whole), 50, axis=0), 2, contact_px=1.8, ring=False))
@@ -149,6 +153,7 @@ def test_stray_light_and_specks_do_not_change_the_layout():
     assert same(found.best.pins, pins), found.best.line()
 
 
+@pytest.mark.usefixtures("few_sizes")
 @pytest.mark.parametrize(
     ("shown", "offered"),
     [
@@ -205,6 +210,7 @@ def test_frames_of_inverted_contrast_show_the_same_layout_of_dark_pins():
     assert (found.polarity, found.best.pins.layout, found.best.pins.rings) == ("dark", "rings", 4) and found.sure
 
 
+@pytest.mark.usefixtures("few_sizes")
 def test_thresholded_frames_of_fading_light_are_not_sure():
     """A fixed threshold makes caps in dark corners black, and those before them small; a local one leaves them alike."""
     pins = PinsSpec(rings=6)

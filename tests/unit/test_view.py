@@ -128,13 +128,19 @@ def test_weights_refuse_a_displaced_picture_of_their_unit(name, change, words):
         model.at_rest(drawn(model, carried(known_of(name), **change)))
 
 
+@cache
+def pressed_nodes(name, real_dir):
+    """Pins (N, 2) of a real contact."""
+    recording = open_recording(real_dir / name.replace("mg400", "tac-vgnn"), model_of(name).sensor, None)
+    return model_of(name).at_known_rest().pipeline(recording.read(len(recording) // 2)).graph.nodes_px
+
+
 @pytest.mark.parametrize("name", WEIGHTS)
 @pytest.mark.parametrize("change", [{"turn_deg": 4.0}, {"scale": (1.04, 1.04)}, {"shift_px": (8.0, -5.0)}], ids=str)
 def test_a_small_displacement_of_the_picture_is_corrected(name, change, real_dir):
     """Both frames are displaced alike. Without the correction 4 deg change the angle by up to a degree."""
     model, known = model_of(name), known_of(name)
-    recording = open_recording(real_dir / name.replace("mg400", "tac-vgnn"), model.sensor, None)
-    pressed = model.at_known_rest().pipeline(recording.read(len(recording) // 2)).graph.nodes_px
+    pressed = pressed_nodes(name, real_dir)
     both = np.concatenate([known, pressed])
     straight = model.at_rest(drawn(model, known))(drawn(model, pressed))
     seen = carried(both, **change)

@@ -348,7 +348,7 @@ def careless(image):
 def test_code_of_the_user_is_judged_like_the_others(spec, frames, tmp_path, undrawn_charts):
     mine, recording = tmp_path / "mine.py", tmp_path / "frames"
     recording.mkdir()
-    for frame in frames:
+    for frame in frames[:1]:
         cv2.imwrite(str(recording / f"{frame.name}.png"), frame.image)
     sweep = SweepPlan(steps=(1.0,), condition=(ConditionPlan(name="hot-pixels"),))
     level = int(np.mean([np.percentile(frame.image, 50) + frame.image.max() for frame in frames]) / 2)

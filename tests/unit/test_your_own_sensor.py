@@ -459,7 +459,7 @@ def test_strange_frames_give_a_right_answer_or_an_error_in_words(tmp_path, chang
         assert "\n" not in str(error).strip() and isinstance(error, TwinError)
         assert not (tmp_path / "odd.toml").exists()
     else:
-        right = (found.sensor.pins.layout, found.sensor.pins.rings) == ("rings", 4)
+        right = found.sensor.pins.layout == "rings" and found.sensor.pins.rings == 4
         assert right or not found.identified.sure
 
 

@@ -5,6 +5,7 @@ import numpy as np
 from drawn_frames import draw_discs, smooth_warp
 
 from twin.geometry.pins import pin_lattice
+from twin.pins.labelling.identify import SIZES
 
 SIZE, RADIUS = (300, 252), 108.0  # px: small frames, in which 331 pins still stand 11 px apart
 
@@ -33,3 +34,14 @@ def frames_of(rest, count=3, *, size=SIZE, contact_px=4.2, ring=True, level=(20,
 def leave_out_costs(monkeypatch):
     """Make new sensors without the costs of their assumptions."""
     monkeypatch.setattr("twin.calibration.new_sensor.cost_of_assumptions", lambda sensor, *, progress: [])
+
+
+def search_few_sizes(monkeypatch):
+    """Search frames of this module's size for spots of four sizes of eight: its caps have one of them."""
+    monkeypatch.setattr("twin.pins.labelling.identify.SIZES", SIZES[2:6])
+
+
+def leave_out_other_layouts(monkeypatch):
+    """Make checks and tunings search frames for no layout but the sensor's own."""
+    for module in ("twin.pins.check", "twin.pins.detectors.tune"):
+        monkeypatch.setattr(f"{module}.other_layout", lambda layout, images: [])

@@ -1,13 +1,14 @@
 """A drawn data set, simulated contacts and models trained on them, shared by all tests that only look at them."""
 
 import os
+import sys
 
 import numpy as np
 import pytest
 from drawn_recording import config_of, drawn_dataset
 from filelock import FileLock
 from small_generation import SENSOR, small_config
-from unknown_sensor import leave_out_costs
+from unknown_sensor import leave_out_costs, leave_out_other_layouts, search_few_sizes
 
 from scenes import load_experiment, load_sensor
 from training.generation import generate
@@ -96,6 +97,22 @@ def no_assumption_costs(monkeypatch):
 
 
 @pytest.fixture
+def no_other_layout(monkeypatch):
+    """Frames are searched for no layout but the sensor's own, which takes most of a check and a tuning: for tests of something else."""
+    leave_out_other_layouts(monkeypatch)
+
+
+@pytest.fixture
+def few_sizes(monkeypatch):
+    """Frames are searched for spots of few sizes: for tests that look at something else than the spots of an unknown sensor."""
+    search_few_sizes(monkeypatch)
+
+
+@pytest.fixture
 def undrawn_charts(monkeypatch):
     """Charts of pages are made, but not drawn, which takes seconds: for tests that look at something else of a page."""
-    monkeypatch.setattr("twin.report.charts.save_figure", lambda path, figure, **_: write_image(path, np.zeros((8, 8), np.uint8)))
+    import twin.report.charts  # noqa: F401
+
+    for module in ("twin.report.charts", "training.studies.judging", "training.environments.learn"):
+        if module in sys.modules:  # each holds the function under its own name
+            monkeypatch.setattr(f"{module}.save_figure", lambda path, figure, **_: write_image(path, np.zeros((8, 8), np.uint8)))

@@ -103,6 +103,7 @@ def test_too_few_frames_are_an_answer_and_not_a_clean_bill(planted, frames):
     assert not enough.not_assessed and np.isfinite(enough.executed).all()
 
 
+@pytest.mark.usefixtures("undrawn_charts")
 def test_of_too_few_frames_no_corrected_labels_are_written(planted, tmp_path):
     pins, labels, executed, _, _ = planted
     for count in (30, 600):

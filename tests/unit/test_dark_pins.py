@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from drawn_frames import draw_discs, smooth_warp
 from scipy.spatial import cKDTree
-from unknown_sensor import frames_of, leave_out_costs, rest_of
+from unknown_sensor import frames_of, leave_out_costs, rest_of, search_few_sizes
 
 from scenes.pins import PinsSpec
 from scenes.sensor import AppearanceSpec, BlobSpec, CameraSpec, PipelineSpec, SensorSpec
@@ -83,9 +83,11 @@ def made(tmp_path_factory):
         cv2.imwrite(str(folder / f"frame_{k}.png"), image)
     with pytest.MonkeyPatch.context() as patch:
         leave_out_costs(patch)
+        search_few_sizes(patch)
         return new_sensor(folder, folder.with_name("dark.toml")), images, places
 
 
+@pytest.mark.usefixtures("few_sizes")
 def test_a_sensor_of_dark_pins_is_made_checked_and_tuned(made):
     """The state of its own frames is good, and a tuning of them finds the same pins in the same polarity."""
     found, images, places = made
@@ -106,6 +108,7 @@ def test_a_sensor_of_dark_pins_is_made_checked_and_tuned(made):
         tune([Frame(255 - frame.image, Form.RAW) for frame in frames], found.sensor)
 
 
+@pytest.mark.usefixtures("no_other_layout", "few_sizes")
 def test_white_skin_around_dark_caps_is_saturated_and_black_caps_are_not(made):
     found, _, _ = made
     images, _ = dots(1, level=(290, 0), light=0.0, corner=0.0)
@@ -116,7 +119,7 @@ def test_white_skin_around_dark_caps_is_saturated_and_black_caps_are_not(made):
     assert findings["saturation"].verdict is Grade.HEALTHY
 
 
-@pytest.mark.usefixtures("no_assumption_costs")
+@pytest.mark.usefixtures("no_assumption_costs", "few_sizes")
 def test_thresholded_frames_of_dark_pins_are_recognised(tmp_path):
     images, _ = dots(light=0.0, corner=0.0)
     white = [np.where(image > 130, 255, 0).astype(np.uint8) for image in images]
@@ -182,6 +185,7 @@ def test_pins_at_the_same_place_are_an_error_in_words_not_a_division_by_zero():
         match(make_reference(rest, GRID), rest_of(GRID), np.ones(63))
 
 
+@pytest.mark.usefixtures("no_other_layout")
 def test_a_pin_out_of_view_is_not_put_on_another_one():
     """Two frames that are labelled differently may give an unseen pin the median place at which the frame at rest shows another pin."""
     images = frames_of(rest_of(PinsSpec(rings=4)), 1, contact_px=1e-9)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from drawn_frames import draw_discs, drawn_frame, smooth_warp
+from unknown_sensor import leave_out_other_layouts
 
 from scenes import load_sensor
 from twin.errors import FrameError, OptionError
@@ -58,7 +59,9 @@ def foreign(spec):
 @pytest.fixture(scope="module")
 def tuned_by(spec, foreign):
     """A tuning by each method."""
-    return cache(partial(tune, foreign[0], spec))
+    with pytest.MonkeyPatch.context() as patch:
+        leave_out_other_layouts(patch)
+        yield cache(partial(tune, foreign[0], spec))
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +97,7 @@ def test_a_tuning_tells_what_it_left_out_and_frames_of_another_size(spec, tuned,
     assert not tune_on_frames(tmp_path, spec, limit=3).odd
 
 
+@pytest.mark.usefixtures("no_other_layout")
 def test_a_tuning_says_whether_its_pins_at_rest_were_made_from_contacts(spec, foreign):
     uneven = foreign[1][0] + np.random.default_rng(0).normal(0, 0.9, foreign[1][0].shape)  # as no frame without contact is
     contact, given = (
@@ -138,6 +142,7 @@ def test_frames_without_a_layout_are_refused(spec):
         tune([black], spec)
 
 
+@pytest.mark.usefixtures("no_other_layout")
 def test_recordings_are_tuned_without_a_crop(spec):
     rest = nominal_reference(spec, Form.PROCESSED).pins_px
     frames = [drawn_frame(spec, Form.PROCESSED, smooth_warp(rest, 4.0, np.random.default_rng(k))) for k in range(2)]
@@ -160,6 +165,7 @@ def test_a_tuning_that_is_worse_than_the_specification_says_so(spec, tuned, tmp_
         assert any("specification itself finds all pins in 100% of these frames" in note for note in odd) == (rate == 0.0), odd
 
 
+@pytest.mark.usefixtures("no_other_layout")
 def test_frames_of_a_sensor_without_a_recording_form_are_raw(spec, foreign, tmp_path):
     """Whatever they look like: these are thresholded."""
     for frame in foreign[0]:

@@ -48,6 +48,7 @@ def test_an_undamaged_sensor_has_no_bad_finding():
     assert set(found) == {"brightness", "saturation", "focus", "glare", "stray light", "layout", "pins", "specks", *PLACE}
 
 
+@pytest.mark.usefixtures("no_other_layout")
 @pytest.mark.parametrize(
     ("name", "severity", "finding"),
     [
@@ -67,6 +68,7 @@ def test_a_planted_fault_is_named(name, severity, finding):
     assert found[finding].verdict is not Grade.HEALTHY and found[finding].remedy, found
 
 
+@pytest.mark.usefixtures("no_other_layout")
 def test_a_white_housing_beside_a_pad_is_no_glare_and_a_white_patch_on_it_is():
     pad = load_sensor("pad-rectangular")
     rest = nominal_reference(pad, Form.RAW)
@@ -87,6 +89,7 @@ def test_a_black_frame_is_bad_and_nothing_crashes():
     assert found["pins"].verdict is Grade.FAILED and found["brightness"].verdict is Grade.FAILED and "place" in found
 
 
+@pytest.mark.usefixtures("no_other_layout")
 def test_frames_that_cannot_be_used_are_named():
     spec = load_sensor("mg400-127")
     rest = nominal_reference(spec, Form.PROCESSED).pins_px
@@ -128,6 +131,7 @@ def test_a_contact_is_not_taken_for_a_nearer_camera(contact):
     assert zoomed.scale_at_rest == pytest.approx(1.05 * drift.scale_at_rest, rel=0.01)
 
 
+@pytest.mark.usefixtures("no_other_layout")
 @pytest.mark.parametrize("shift_px", [0.0, 6.0])
 def test_frames_of_the_size_for_which_the_detector_was_tuned_are_checked(tmp_path, shift_px):
     """A recording of another size than the specification's: 'twin tune' takes it, so 'twin check' takes it with what that wrote.

@@ -51,7 +51,7 @@ BOX, BALL = "type='box' size='.03 .03 .01'", "type='sphere' size='.02'"
 @pytest.mark.parametrize("mass", [0.02, 0.1])
 def test_a_body_at_rest_on_the_sensor_weighs_its_weight(shape, mass):
     scene = scene_of(above(shape, 29.0 if shape == BOX else 39.0, mass=mass))
-    scene.step(4000)
+    scene.step(2000)
     force = scene.read("tip").force_n
     assert np.allclose(force, [0, 0, mass * WEIGHT], atol=0.01 * mass * WEIGHT + 0.01)
     assert abs(force[2] / (mass * WEIGHT) - 1) < 0.01
@@ -252,7 +252,7 @@ def play(seed, grip_n):
 
 
 def test_a_lift_needs_the_right_grip_for_each_object():
-    for seed in range(2):
+    for seed in range(1):
         rewards, info = play(seed, lambda env: WANTED * env.least_n)
         assert info["is_success"] and rewards[-1] > BONUS
         for share, why in ((0.8, "dropped"), (1.1 * CRUSH, "crushed")):
@@ -263,7 +263,7 @@ def test_a_lift_needs_the_right_grip_for_each_object():
 def test_most_objects_of_a_lift_break_or_fall_with_any_constant_grip():
     env = gymnasium.make("tactip/GraspLift-v0", observation="none").unwrapped
     least, seen = [], []
-    for seed in range(300):
+    for seed in range(150):
         _, drawn = env.reset(seed=seed)
         least.append(env.least_n)
         seen.append((drawn["mass_kg"], drawn["friction"]))
@@ -322,7 +322,7 @@ def test_wrong_options_of_an_episode_are_refused_by_name(task, wrong):
 
 def test_a_scripted_controller_inserts_pegs_by_what_the_sensors_feel():
     env = gymnasium.make("tactip/PegInsert-v0", observation="none").unwrapped
-    for seed in (0, 1):
+    for seed in (0,):
         _, start = env.reset(seed=seed)
         assert np.linalg.norm(start["off_mm"]) <= 5 and abs(start["tilt_deg"]) <= 5
         expert, over, rewards = Expert(env), False, []
@@ -354,7 +354,7 @@ def test_a_peg_task_is_an_environment_for_gymnasium_that_repeats_and_can_be_stor
     seen = []
     for each in (env, again, env):
         each.reset(seed=5)
-        seen.append([each.step(np.array([0.2, 0.0, -1.0, 0.1]))[0] for _ in range(8)][-1])
+        seen.append([each.step(np.array([0.2, 0.0, -1.0, 0.1]))[0] for _ in range(4)][-1])
     assert all(np.array_equal(seen[0][name], other[name]) for other in seen[1:] for name in seen[0])
 
 

@@ -129,7 +129,7 @@ def test_a_policy_of_an_own_sensor_knows_the_contacts_of_its_training(tmp_path, 
     """Its file holds them: it knows the motions that it learnt from, and no torn frame."""
     monkeypatch.setattr(policy_domain, "_shipped_estimator", lambda sensor: None)
     monkeypatch.setattr(policy_domain, "ACTING_STEPS", 150)
-    made = learn_policy(LearnPlan("SurfaceFollow", SMALL, minutes=0.02, environments=4, episodes=1), tmp_path)
+    made = learn_policy(LearnPlan("SurfaceFollow", SMALL, minutes=0.002, environments=4, episodes=1), tmp_path)
     again = load_policy(tmp_path / "policy.safetensors")
     known = contacts_of(again)
     displacements = known.seen_from(known.reference, "rest")
@@ -181,7 +181,7 @@ def few_looks(monkeypatch):
 
 
 def test_a_policy_is_learnt_in_small(tmp_path, few_looks):
-    plan = LearnPlan("SurfaceFollow", SMALL, minutes=0.02, environments=2, episodes=2)
+    plan = LearnPlan("SurfaceFollow", SMALL, minutes=0.002, environments=2, episodes=2)
     made = learn_policy(plan, tmp_path)
     assert {path.name for path in made.written} == {"policy.safetensors", "learning.csv", "learning.png", "result.json"}
     assert all(path.is_file() for path in made.written)

@@ -24,13 +24,7 @@ CENTROID_RAW_PX = 0.05  # rms on a drawn gray cap with noise: a tenth of what re
 CENTROID_BINARY_PX = 0.2  # rms of a thresholded cap's centroid: its rim is known to a pixel only
 SAME_PIN_PX = 3.0  # a pin further from its truth carries another pin's name
 
-FORMS = [
-    ("mg400-331", Form.RAW),
-    ("mg400-331", Form.PROCESSED),
-    ("mg400-127", Form.RAW),
-    ("mg400-127", Form.PROCESSED),
-    ("ur5-331", Form.RAW),
-]
+FORMS = [("mg400-331", Form.PROCESSED), ("mg400-127", Form.RAW), ("ur5-331", Form.RAW)]
 
 
 @pytest.fixture(scope="module", params=FORMS, ids=lambda p: f"{p[0]}-{p[1]}")
@@ -277,7 +271,7 @@ def test_a_layout_that_lost_a_column_is_named_right_or_not_at_all(lights):
     pipeline = Pipeline(load_sensor("pad-rectangular"), Form.RAW)
     rest, pitch = pipeline.reference.pins_px, pitch_px(pipeline)
     first, last = (np.flatnonzero(np.abs(rest[:, 0] - end) < pitch / 2) for end in (rest[:, 0].min(), rest[:, 0].max()))
-    for displaced in np.arange(0.0, 0.7, 0.1):
+    for displaced in np.arange(0.0, 0.7, 0.15):
         truth = rest + (displaced * pitch, 0)
         seen_px = np.concatenate([np.delete(truth, last, axis=0), truth[first[:lights]] - (pitch, 0)])
         observation = pipeline(draw(pipeline, seen_px, radius_px=0.28 * pitch))
@@ -350,7 +344,7 @@ def deeply_pressed(reference, at, depth):
 def test_a_ring_squeezed_around_a_stretched_field_keeps_every_name(name, damage):
     rest, rng = Pipeline(load_sensor(name), Form.PROCESSED).reference, np.random.default_rng(3)
     kept = np.setdiff1d(np.arange(len(rest.pins_px)), [5, 40, 77] if damage == "lost" else [])
-    for at in ((0.0, 0.0), (0.15, -0.1), (-0.2, 0.05)):
+    for at in ((0.0, 0.0), (-0.2, 0.05)):
         truth = deeply_pressed(rest, np.array(at), 1.2)
         px, area = truth[kept], np.full(len(kept), 30.0)
         if damage == "specks":
@@ -568,7 +562,7 @@ def test_a_damaged_frame_names_its_pins_as_the_whole_one(real_dir, name, folder)
     pipeline = Pipeline(spec, recording.form, measure_reference(spec, recording.form, recording.reference))
     rng = np.random.default_rng(0)
     shift = np.float32([[1, 0, 6], [0, 1, -5]])
-    for k in range(11, len(recording), 200):
+    for k in range(11, len(recording), 400):
         frame = recording.read(k)
         whole = pipeline(frame)
         gone = rng.choice(spec.pins.count, spec.pins.count // 15, replace=False)

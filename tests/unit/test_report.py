@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from made_up_pages import HOSTILE, PAGES
 from sound_page import PageReader, read_sound_page
 
-from twin.report.charts import muted_colour, new_figure, write_chart
+from twin.frames.images import write_image
+from twin.report.charts import muted_colour, new_figure, save_figure, write_chart
 from twin.report.page import (
     DARK,
     GROUP,
@@ -61,7 +62,14 @@ WHITE = np.array([0.9505, 1.0, 1.089])  # D65
 
 @pytest.fixture(scope="module", params=PAGES)
 def made(request, tmp_path_factory):
-    return PAGES[request.param](tmp_path_factory.mktemp(request.param))
+    """A page whose charts are drawn in the light theme, and made in both."""
+
+    def save_light(path, figure, **options):
+        return write_image(path, np.zeros((8, 8), np.uint8)) if path.stem.endswith("-dark") else save_figure(path, figure, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("twin.report.charts.save_figure", save_light)
+        return PAGES[request.param](tmp_path_factory.mktemp(request.param))
 
 
 # Pages
@@ -136,6 +144,7 @@ def test_contents_are_listed_where_there_are_many_sections(tmp_path):
     assert PageReader(page.html(tmp_path)).addresses == ["#part-0", "#part-1", "#part-2", "#part-more"]
 
 
+@pytest.mark.usefixtures("undrawn_charts")
 def test_the_sim_to_real_page_writes_whole_numbers_whole(tmp_path):
     page = read_sound_page(PAGES["sim-to-real"](tmp_path).read_text(encoding="utf-8"))
     assert "3010" in page.text and f"25{GROUP}344 states" in page.text and not re.search(r"\de[+-]?\d", page.text)

@@ -182,7 +182,7 @@ def real_plan(spec, frames):
 
 
 def test_a_sweep_writes_its_page_and_goes_on_where_it_was(spec, frames, tmp_path, undrawn_charts):
-    plan = real_plan(spec, frames)
+    plan = real_plan(spec, frames[:1])
     counts = []
 
     judged = evaluate_sweep(plan, tmp_path, jobs=1, progress=lambda done, total: counts.append((done, total)))
@@ -203,7 +203,7 @@ def test_a_sweep_writes_its_page_and_goes_on_where_it_was(spec, frames, tmp_path
     counts.clear()
     rows = run_sweep(plan, tmp_path, jobs=1, progress=lambda done, total: counts.append((done, total)))
     assert counts == [(6, 7), (7, 7)] and cells[0].stat().st_mtime_ns == kept
-    assert len(rows) == 3 * 3 * 2 * 2
+    assert len(rows) == 3 * 3 * 2
     assert json.loads(cells[1].read_text())
 
 
@@ -344,10 +344,11 @@ def careless(image):
 """
 
 
+@pytest.mark.usefixtures("no_other_layout")
 def test_code_of_the_user_is_judged_like_the_others(spec, frames, tmp_path, undrawn_charts):
     mine, recording = tmp_path / "mine.py", tmp_path / "frames"
     recording.mkdir()
-    for frame in frames:
+    for frame in frames[:1]:
         cv2.imwrite(str(recording / f"{frame.name}.png"), frame.image)
     sweep = SweepPlan(steps=(1.0,), condition=(ConditionPlan(name="hot-pixels"),))
     level = int(np.mean([np.percentile(frame.image, 50) + frame.image.max() for frame in frames]) / 2)

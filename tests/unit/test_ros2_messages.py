@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from any_message import KINDS, messages
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 from rosbags.typesys import Stores, get_typestore
@@ -41,6 +41,7 @@ def test_bytes_are_those_of_other_libraries_and_come_back(kind):
     write = serialize_dynamic(full_name(kind), definition_of(kind))[full_name(kind)]
     read = generate_dynamic(full_name(kind), definition_of(kind))[full_name(kind)]
 
+    @settings(max_examples=40)
     @given(messages(kind))
     def check(message):
         data = encode(kind, message)

@@ -216,7 +216,7 @@ def test_the_twin_read_backwards_finds_labels_and_learns_what_the_twin_misses(se
         moved = edge_pins(labels, rest * [sense, 1])  # seen from behind, the edge turns the other way as its label grows
         return moved * [sense, 1]
 
-    simulated, few, asked = contacts(300), contacts(30), contacts(30)
+    simulated, few, asked = contacts(200), contacts(30), contacts(30)
     twin = ModelInversion(pins(simulated), simulated, rest, ranges)
     shifted = rng.normal(0, 0.2, (60, 2))
     real = [1.1 * pins(each) + shifted + rng.normal(0, 0.02, (len(each), 60, 2)) for each in (few, asked)]
@@ -238,14 +238,14 @@ def test_a_twin_without_unknown_labels_or_without_noise_is_read_as_well():
     rest = rng.uniform(-60, 60, (60, 2))
     ranges = np.zeros((12, 2))
     ranges[[1, 2, 5]] = [[1, 1], [4, 4], [-180, 180]]
-    only = [ArmLabel(each[:6], each[6:]) for each in rng.uniform(*ranges.T, (200, 12))]
+    only = [ArmLabel(each[:6], each[6:]) for each in rng.uniform(*ranges.T, (100, 12))]
     truth = np.array([label.pose[5] for label in only])
     found = ModelInversion(edge_pins(only, rest), only, rest, ranges).estimate(np.zeros((0, 60, 2)), [], edge_pins(only[:20], rest))
     assert np.abs((found[:, 5] - truth[:20] + 180) % 360 - 180).max() < 1.0, "the direction alone is unknown, the pins have no noise"
     known = ranges.copy()
     known[1:3], known[5] = [[-6, 6], [3, 5]], 30.0
     ranges[1:3] = known[1:3]
-    around = [ArmLabel(each[:6], each[6:]) for each in rng.uniform(*ranges.T, (300, 12))]
+    around = [ArmLabel(each[:6], each[6:]) for each in rng.uniform(*ranges.T, (150, 12))]
     asked = [ArmLabel(each[:6], each[6:]) for each in rng.uniform(*known.T, (20, 12))]
     twin = ModelInversion(edge_pins(around, rest), around, rest, known)
     found = twin.estimate(np.zeros((0, 60, 2)), [], edge_pins(asked, rest) + rng.normal(0, 0.01, (20, 60, 2)))

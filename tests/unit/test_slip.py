@@ -59,7 +59,7 @@ def plain_eyes(caps_mm, lost, rng):
 def learnt():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(slip, "WAYS", 90)
-        patch.setattr(slip, "EPOCHS", 20)
+        patch.setattr(slip, "EPOCHS", 14)
         rng = np.random.default_rng(0)
         return learn_slip([plain_drag(rng) for _ in range(DRAGS)], plain_eyes, load_sensor("pad-rectangular"))
 
@@ -175,6 +175,7 @@ def test_a_run_that_learnt_from_drags_remembers_them_and_its_small_copy_does(con
         assert 0 <= told["slip_begins"] <= 1 and told["slip_left"] >= 0 and -180 <= told["slip_direction"] <= 180
 
 
+@pytest.mark.usefixtures("undrawn_charts")
 def test_slip_of_simulated_drags_is_judged_and_said(contacts, tmp_path):
     folder, run, sensor = contacts
     estimator = PoseEstimator.load(run)

@@ -29,6 +29,7 @@ CHANCE = 0.2  # few held-out pairs of few patches
 def short(monkeypatch):
     monkeypatch.setattr(module, "BATCH", 16)
     monkeypatch.setattr(module, "PATCHES", 6)
+    monkeypatch.setattr(module, "FOLDS", 3)
 
 
 def pictures(count, seed, *, blue=1.0):

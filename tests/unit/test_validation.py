@@ -73,6 +73,7 @@ def test_a_wrong_executed_flag_shows(recorded, found):
     assert naive.executed.all() and naive.error_px[~found.executed].mean() > 2 * found.error_px[~found.executed].mean()
 
 
+@pytest.mark.usefixtures("undrawn_charts")
 def test_page_and_table_hold_every_frame(found, recorded, tmp_path):
     _, config, _ = recorded
     page, table, _ = write_validation(tmp_path, found, config.sensor.description, summary_of(found, config.sensor.name))

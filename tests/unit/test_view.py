@@ -128,13 +128,19 @@ def test_weights_refuse_a_displaced_picture_of_their_unit(name, change, words):
         model.at_rest(drawn(model, carried(known_of(name), **change)))
 
 
+@cache
+def pressed_nodes(name, real_dir):
+    """Pins (N, 2) of a real contact."""
+    recording = open_recording(real_dir / name.replace("mg400", "tac-vgnn"), model_of(name).sensor, None)
+    return model_of(name).at_known_rest().pipeline(recording.read(len(recording) // 2)).graph.nodes_px
+
+
 @pytest.mark.parametrize("name", WEIGHTS)
 @pytest.mark.parametrize("change", [{"turn_deg": 4.0}, {"scale": (1.04, 1.04)}, {"shift_px": (8.0, -5.0)}], ids=str)
 def test_a_small_displacement_of_the_picture_is_corrected(name, change, real_dir):
     """Both frames are displaced alike. Without the correction 4 deg change the angle by up to a degree."""
     model, known = model_of(name), known_of(name)
-    recording = open_recording(real_dir / name.replace("mg400", "tac-vgnn"), model.sensor, None)
-    pressed = model.at_known_rest().pipeline(recording.read(len(recording) // 2)).graph.nodes_px
+    pressed = pressed_nodes(name, real_dir)
     both = np.concatenate([known, pressed])
     straight = model.at_rest(drawn(model, known))(drawn(model, pressed))
     seen = carried(both, **change)
@@ -220,6 +226,7 @@ def test_pushes_to_known_sides_tell_turn_and_mirror(tmp_path, change, by):
         assert np.nanmax(np.linalg.norm(away, axis=1)) < 0.2 * spacing
 
 
+@pytest.mark.usefixtures("no_other_layout")
 def test_the_written_copy_is_a_sensor_and_wrong_sides_are_refused(tmp_path):
     spec, frames = frames_of("mg400-127", turn_deg=180.0)
     for side, frame in frames.items():
@@ -242,6 +249,7 @@ def test_the_written_copy_is_a_sensor_and_wrong_sides_are_refused(tmp_path):
         registered_view(spec, frames["rest"], {"left": frames["x"], "y": frames["y"]})
 
 
+@pytest.mark.usefixtures("no_other_layout")
 def test_check_names_stretch_and_mirror():
     """The specification holds its unit's own places at rest."""
     spec = model_of("mg400-127").recorded_sensor
@@ -300,8 +308,8 @@ def test_real_frames_of_a_displaced_camera_keep_their_estimates(real_dir, folder
             assert made.valid and np.all(np.abs(made.value - before.value) < LIKE_STRAIGHT * (before.high - before.low) / 2), change
     with pytest.raises(FrameError, match="turned by -?180"):
         model.at_rest(warped(recording.reference, centre, turn_deg=180.0))
-    shallow = [k for k, label in enumerate(read_arm_labels(recording)) if 1.5 < label.pose[1] + 5.0 < 1.8][::60]
+    shallow = [k for k, label in enumerate(read_arm_labels(recording)) if 1.5 < label.pose[1] + 5.0 < 1.8][::60][:2]
     for k in shallow:
         with pytest.raises(FrameError, match="seems pressed"):
             model.at_rest(recording.read(k))
-    assert len(shallow) > 2
+    assert len(shallow) == 2

@@ -5,21 +5,21 @@ import signal
 import subprocess
 import sys
 import time
-import warnings
 from contextlib import suppress
 from pathlib import Path
 
 import psutil
 import pytest
+from shared_tasks import dying, failing, named, warning
 
 from twin.errors import FrameError, WorkersError
 from twin.workers import in_processes, outcomes
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_S = 60.0
-ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(Path(__file__).parent)])}
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests" / "helpers")])}
 FIRST_PROCESSES = """
-from test_workers import blocked
+from shared_tasks import blocked
 from twin.workers import in_processes
 if __name__ == "__main__":
     print(*map(len, in_processes(blocked, (), [1, 2, 3], processes=2)))
@@ -27,7 +27,7 @@ if __name__ == "__main__":
 MAIN = """
 import signal
 import sys
-from test_workers import sleeping
+from shared_tasks import sleeping
 from twin.workers import in_processes
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background of a script begins with SIGINT ignored
@@ -36,59 +36,6 @@ if __name__ == "__main__":
     except KeyboardInterrupt:
         sys.exit("interrupted")
 """
-
-
-def named(prefix):
-    """Begins with a text; each call gives its task and process."""
-    return lambda task: (f"{prefix}{task}", os.getpid())
-
-
-def failing(where):
-    """Fails at the beginning or at a task."""
-
-    def fail(*_):
-        raise FrameError(where)
-
-    return fail() if where == "begin" else fail
-
-
-def warning():
-    """Warns at every task."""
-
-    def warn(task):
-        warnings.warn("the disk is slow", RuntimeWarning, stacklevel=1)
-        return os.getpid()
-
-    return warn
-
-
-def dying(folder, always=""):
-    """The first call of every task ends its process; of the task ``always`` each call."""
-
-    def die(task):
-        mark = Path(folder, str(task))
-        if task == always or not mark.exists():
-            mark.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        return task
-
-    return die
-
-
-def sleeping(folder):
-    """Sleeps for longer than any test, and says so."""
-    Path(folder, "begun").touch()
-
-    def sleep(task):
-        Path(folder, f"at work {os.getpid()}").touch()
-        time.sleep(600)
-
-    return sleep
-
-
-def blocked():
-    """Each call gives the signals that its process blocks."""
-    return lambda task: signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
 def listening(pid_text: str, index: int) -> list[str]:

@@ -226,13 +226,6 @@ def type_of(name: str) -> str:
     return next((kind for kind, names in NAMES.items() if re.fullmatch(names, name)), "NOT_FOUND")
 
 
-@cache
-def packed(names: tuple[str, ...]) -> tuple[str, list[int]]:
-    """The layout of RTDE variables in a packet, and how many numbers each has."""
-    layouts = [TYPES[type_of(name)] for name in names]
-    return ">" + "".join(layouts), [int(layout[:-1] or 1) for layout in layouts]
-
-
 class UrEmulator(EmulatedArm):
     """A UR5 on loopback. A context manager, which listens between ``start`` and ``stop``.
 
@@ -293,11 +286,11 @@ class UrEmulator(EmulatedArm):
             present = self.arm.cycle()
             values = values if "frozen-feedback" in self.faults else present
             for connection, names in self._streams.copy().items() if "silent" not in self.faults else ():
-                layout, sizes = packed(tuple(names))
-                given = ((values.get(name, 0), size) for name, size in zip(names, sizes, strict=True))
-                numbers = [number for value, size in given for number in (value if hasattr(value, "__len__") else size * (value,))]
+                layouts = [TYPES[type_of(name)] for name in names]
+                given = ((values.get(name, 0), int(layout[:-1] or 1)) for name, layout in zip(names, layouts, strict=True))
+                numbers = [number for value, size in given for number in (size * (value,) if np.isscalar(value) else value)]
                 with contextlib.suppress(OSError):
-                    _send(connection, b"U", b"\1" + struct.pack(layout, *numbers))
+                    _send(connection, b"U", b"\1" + struct.pack(">" + "".join(layouts), *numbers))
 
     def _serve_dashboard(self, connection: socket.socket) -> None:
         connection.sendall(b"Connected: Universal Robots Dashboard Server\n")
@@ -349,7 +342,7 @@ class UrEmulator(EmulatedArm):
             self._owner = None if self._owner is connection else self._owner
 
     def _take(self, names: list[str], content: bytes) -> None:
-        numbers = struct.unpack(packed(tuple(names))[0], content)
+        numbers = struct.unpack(">" + "".join(TYPES[type_of(name)] for name in names), content)
         with self.arm.lock:
             self.arm.inputs.update(zip(names, numbers, strict=False))
             self.arm.written_s = time.monotonic()

@@ -9,14 +9,9 @@ def matrix_of(pose: np.ndarray) -> np.ndarray:
     x, y, z, *angles = np.asarray(pose, float).tolist()
     turns = np.radians(angles)
     (sa, sb, sc), (ca, cb, cc) = np.sin(turns).tolist(), np.cos(turns).tolist()
-    return np.array(
-        [
-            [cb * cc, sa * sb * cc - ca * sc, ca * sb * cc + sa * sc, x],
-            [cb * sc, sa * sb * sc + ca * cc, ca * sb * sc - sa * cc, y],
-            [-sb, sa * cb, ca * cb, z],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
+    along_x = [cb * cc, sa * sb * cc - ca * sc, ca * sb * cc + sa * sc, x]
+    along_y = [cb * sc, sa * sb * sc + ca * cc, ca * sb * sc - sa * cc, y]
+    return np.array([along_x, along_y, [-sb, sa * cb, ca * cb, z], [0.0, 0.0, 0.0, 1.0]])
 
 
 def pose_of(T: np.ndarray, near: np.ndarray) -> np.ndarray:

@@ -171,12 +171,12 @@ def _limit_time() -> Iterator[None]:
 def _send_feedback(client: Any, send: Callable[[object], None]) -> None:
     sent = None
     while client.isConnected():
-        if client.getTimestamp() != sent:
-            packet = {name: getattr(client, f"get{name}")() for name in FIELDS}
-            if packet["Timestamp"] == client.getTimestamp():  # not parts of two packets
-                send(packet | {"time_s": time.monotonic()})
-                sent = packet["Timestamp"]
-        time.sleep(LOOK_S)
+        packet = {name: getattr(client, f"get{name}")() for name in FIELDS}
+        if packet["Timestamp"] in (sent, None) or packet["Timestamp"] != client.getTimestamp():  # old, or parts of two packets
+            time.sleep(LOOK_S)
+            continue
+        send(packet | {"time_s": time.monotonic()})
+        sent = packet["Timestamp"]
     os._exit(0)  # at once, also during a request
 
 

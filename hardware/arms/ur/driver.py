@@ -43,12 +43,8 @@ STRAIGHT = 1e-6
 
 def pose_from_ur(pose: np.ndarray) -> np.ndarray:
     """The pose (6,) of one of a UR: its rx is between -90 and 270 deg, so that it does not jump where the tool points down."""
-    return _pose_at(1000.0 * np.asarray(pose[:3]), Rotation.from_rotvec(pose[3:]))
-
-
-def _pose_at(place_mm: np.ndarray, turn: Rotation) -> np.ndarray:
-    angles = turn.as_euler("xyz", degrees=True)
-    return np.r_[place_mm, (angles[0] + 90.0) % 360.0 - 90.0, angles[1:]]
+    angles = Rotation.from_rotvec(pose[3:]).as_euler("xyz", degrees=True)
+    return np.r_[1000.0 * np.asarray(pose[:3]), (angles[0] + 90.0) % 360.0 - 90.0, angles[1:]]
 
 
 def pose_to_ur(pose: np.ndarray) -> list[float]:
@@ -83,7 +79,7 @@ class UrKinematics(StageKinematics):
 
     def forward(self, joints_deg: np.ndarray) -> np.ndarray:
         T = self.flange(joints_deg) @ self.T_flange_tool
-        return _pose_at(T[:3, 3], Rotation.from_matrix(T[:3, :3]))
+        return pose_from_ur(np.r_[T[:3, 3] / 1000.0, Rotation.from_matrix(T[:3, :3]).as_rotvec()])
 
     def inverse(self, pose: np.ndarray) -> np.ndarray:
         """Joints (6,) at the pose (6,); ``OutOfReachError`` where there are none."""

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -95,15 +95,21 @@ class HastyRig(Rig):
     frame_timeout_s = FRAME_WAIT_S
 
 
+@cache
+def dome_images() -> list[np.ndarray]:
+    """Noisy pictures of a dome with pins, which nobody changes."""
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:480, :640]
+    dome = 60.0 + 60.0 * ((x % 24 < 8) & (y % 24 < 8))
+    return [np.clip(dome + rng.normal(0.0, 1.5, dome.shape), 0, 255).astype(np.uint8) for _ in range(9)]
+
+
 class DomeCamera(NoisyCamera):
     """Pictures of a size and a noise as a sensor's camera gives."""
 
     def __init__(self) -> None:
         super().__init__(fps=FPS, size_px=(640, 480))
-        rng = np.random.default_rng(0)
-        y, x = np.mgrid[:480, :640]
-        dome = 60.0 + 60.0 * ((x % 24 < 8) & (y % 24 < 8))
-        self._images = [np.clip(dome + rng.normal(0.0, 1.5, dome.shape), 0, 255).astype(np.uint8) for _ in range(9)]
+        self._images = dome_images()
 
     def _grab(self) -> DevicePicture:
         self._end.wait(self._period_s)

@@ -29,6 +29,7 @@ from twin.types import Form
 
 FIRST_S = 90.0  # kernels may have to be compiled
 STEPS = 12
+FPS = 12.0
 POLICY = Path(__file__).parents[2] / "training" / "policies" / "SurfaceFollow-mg400-331.safetensors"
 
 
@@ -38,7 +39,7 @@ def emulated():
     placed = PlacedObject(load_object("can"), servo.placement, Mounting.of(sensor, load_experiment("surface-2d")))
     with Mg400Emulator(port_offset=None, time_scale=4.0) as arm:
         pose = FeedbackPose("127.0.0.1", tuple(arm.ports[port] for port in FEEDBACK_PERIOD_S))
-        with pose, CameraEmulator(TwinCamera(sensor, placed, pose, Form.RAW)) as camera:
+        with pose, CameraEmulator(TwinCamera(sensor, placed, pose, Form.RAW, fps=FPS)) as camera:
             ports = Mg400Ports(arm.ports[DASHBOARD_PORT], arm.ports[MOTION_PORT], tuple(arm.ports[p] for p in list(FEEDBACK_PERIOD_S)[:2]))
             safe = SafeArm(MG400("127.0.0.1", ports=ports), load_limits("mg400"))
             with Rig(MjpegCamera(camera.url, sensor, Form.PROCESSED), safe, placed, True) as rig:

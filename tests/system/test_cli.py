@@ -44,6 +44,15 @@ def test_render_writes_what_it_says(rendered):
         assert caps["visible"].dtype == bool
 
 
+def test_a_rendered_contact_states_the_interval_of_its_force_in_newtons(rendered):
+    """As wide as the stiffness of the specification is uncertain, in what the command prints and in the file."""
+    out, said = rendered
+    truth = json.loads((out / "truth.json").read_text())
+    size, factor, ends = np.linalg.norm(truth["force_n"]), load_sensor("mg400-127").skin.stiffness_factor, truth["force_size_90_n"]
+    assert ends == pytest.approx([size / factor, size * factor])
+    assert f"(size with 90 %: {ends[0]:.2f} to {ends[1]:.2f} N)" in said
+
+
 def test_preprocess_finds_the_rendered_pins(rendered, tmp_path):
     out, _ = rendered
     done = twin("preprocess", out / "frame.png", "--sensor", "mg400-127", "--out", tmp_path, "--overlay")

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from coarse_skin import use_coarse_skin
 
 from hardware.servo.loop import LoopSettings, ServoLoop
 from hardware.workcell.build import RigPlan, build_rig
@@ -22,7 +23,8 @@ def torn(image):
 @pytest.mark.parametrize(
     "change", [lambda image: np.roll(image, 9, 1), torn, lambda image: image[:, ::-1].copy()], ids=["rolled", "torn", "mirrored"]
 )
-def test_a_strange_frame_holds_the_arm_and_the_next_good_one_goes_on(change):
+def test_a_strange_frame_holds_the_arm_and_the_next_good_one_goes_on(change, monkeypatch):
+    use_coarse_skin(monkeypatch)
     model, servo = PoseEstimator.load("mg400-331"), load_servo("surface")
     plan = RigPlan(load_object("can"), servo, camera="twin", arm="simulated", plain_light=True)
     rig = build_rig(plan, model.sensor, load_experiment(servo.experiment), form=model.form, at_once=True)

@@ -1,14 +1,15 @@
 """The whole way on rendered frames: press, render, detect, graph, against exact truth."""
 
-import json
 from functools import cache
 
 import numpy as np
 import pytest
 
 from scenes import SpecError, load_object, load_sensor
+from twin.geometry.solid import Resolution
 from twin.mechanics.path import ContactPose
-from twin.one_contact import RenderedContact, look_at, render_contact
+from twin.mechanics.solver import SkinSolver
+from twin.one_contact import RenderedContact, look_at
 from twin.pins.graph import make_graph
 from twin.pins.labelling.reference import nominal_reference
 from twin.pins.pipeline import Pipeline
@@ -22,7 +23,8 @@ FORMS = [(name, form) for name in ("mg400-331", "mg400-127") for form in Form] +
 
 @pytest.fixture(scope="module")
 def simulators():
-    return {name: Simulator(load_sensor(name)) for name in ("mg400-331", "mg400-127", "ur5-331")}
+    specs = [load_sensor(name) for name in ("mg400-331", "mg400-127", "ur5-331")]
+    return {spec.name: Simulator(spec, solver=SkinSolver(spec, resolution=Resolution(10))) for spec in specs}
 
 
 @pytest.fixture(scope="module")
@@ -126,13 +128,3 @@ def test_a_picture_in_which_the_pipeline_finds_no_pins_is_said():
     rendered = simulator.render(simulator.rest)
     said = RenderedContact(simulator.rest, rendered, look_at(simulator, rendered), [], simulator.spec.skin.stiffness_factor).lines()
     assert "note: the pipeline can't use the picture: too few pins" in said[1]
-
-
-def test_a_rendered_contact_states_the_interval_of_its_force_in_newtons(tmp_path):
-    """As wide as the stiffness of the specification is uncertain, in what the command prints and in the file."""
-    spec = load_sensor("mg400-127")
-    result = render_contact(spec, load_object("plane"), ContactPose(indent_mm=1.0), tmp_path, quality="rasterised")
-    size, factor = np.linalg.norm(result.state.force_n), spec.skin.stiffness_factor
-    ends = json.loads((tmp_path / "truth.json").read_text())["force_size_90_n"]
-    assert ends == pytest.approx([size / factor, size * factor])
-    assert f"(size with 90 %: {ends[0]:.2f} to {ends[1]:.2f} N)" in result.lines()[0]

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from scenes.layouts.base import LatticeLayout
 from scenes.pins import PinsSpec
+from twin.compiled import compiled
 from twin.geometry.pins import pin_lattice, usual_spacing
 from twin.pins.finding.bumps import Bumps
 
@@ -153,25 +154,45 @@ def _lay_lattice(px: np.ndarray, by: Family) -> Iterator[np.ndarray]:
     yield from (start for start in laid[:5] if (start >= 0).sum() >= LEAST_GROWN)
 
 
-def predict_places(
-    which: np.ndarray, lattice: np.ndarray, around: np.ndarray, spot: np.ndarray, px: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (n, 2) of places ``which`` (n,) as their labelled neighbours predict them, and local spacings (n,), px.
+@compiled()
+def _predict(place: int, lattice: np.ndarray, around: np.ndarray, spot: np.ndarray, px: np.ndarray) -> tuple[complex, float]:
+    """Position x + iy of a place as its labelled neighbours predict it, and local spacing, px.
 
     The prediction is a weighted affine map. It is NaN if the map is not determined, mirrors the lattice, or stretches it too much.
     """
-    near, labels = around[which], spot[around[which]]
-    away = lattice[near] - lattice[which, None]
-    terms = np.concatenate([np.ones((*near.shape, 1)), away], axis=2)
-    weighted = (terms * ((labels >= 0) / (0.5 + (away**2).sum(axis=2)))[..., None]).transpose(0, 2, 1)
-    normal = weighted @ terms
-    known = ((labels >= 0).sum(axis=1) >= 3) & (np.abs(np.linalg.det(normal)) >= 1e-6 * normal[:, 0, 0] ** 3)
-    normal[~known] = np.eye(3)
-    fit = np.linalg.solve(normal, weighted @ px[labels])
-    half, area = (fit[:, 1:] ** 2).sum(axis=(1, 2)) / 2, fit[:, 1, 0] * fit[:, 2, 1] - fit[:, 2, 0] * fit[:, 1, 1]
-    root = np.sqrt(np.maximum(half**2 - area**2, 0))  # squares of the map's scales are half -+ root
-    known &= (area > 0) & (half + root <= MOST_STRETCH**2 * (half - root))
-    return np.where(known[:, None], fit[:, 0], np.nan), np.where(known, np.sqrt(np.maximum(half - root, 0)), np.nan)
+    count, total, x, y, xx, xy, yy, at, at_x, at_y = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0j, 0j, 0j
+    nothing = complex(np.nan, np.nan), np.nan
+    for near in around[place]:
+        if spot[near] >= 0:
+            dx, dy = lattice[near, 0] - lattice[place, 0], lattice[near, 1] - lattice[place, 1]
+            z = complex(px[spot[near], 0], px[spot[near], 1])
+            weight = 1.0 / (0.5 + dx * dx + dy * dy)
+            count, total, x, y, at = count + 1, total + weight, x + weight * dx, y + weight * dy, at + weight * z
+            xx, xy, yy = xx + weight * dx * dx, xy + weight * dx * dy, yy + weight * dy * dy
+            at_x, at_y = at_x + weight * dx * z, at_y + weight * dy * z
+    if count < 3:
+        return nothing
+    x, y, at = x / total, y / total, at / total
+    xx, xy, yy, at_x, at_y = xx - total * x * x, xy - total * x * y, yy - total * y * y, at_x - total * x * at, at_y - total * y * at
+    determinant = xx * yy - xy * xy
+    if determinant < 1e-6 * total * total:
+        return nothing
+    east, north = (at_x * yy - at_y * xy) / determinant, (at_y * xx - at_x * xy) / determinant
+    half, area = (abs(east) ** 2 + abs(north) ** 2) / 2, (east.conjugate() * north).imag
+    root = np.sqrt(max(half * half - area * area, 0.0))  # squares of the map's scales are half -+ root
+    if area <= 0 or half + root > MOST_STRETCH**2 * (half - root):
+        return nothing
+    return at - x * east - y * north, np.sqrt(max(half - root, 0.0))
+
+
+@compiled()
+def _predictions(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, spot: np.ndarray) -> np.ndarray:
+    """Predicted positions and local spacings (M, 3) of all places, px."""
+    out = np.empty((len(lattice), 3))
+    for place in range(len(lattice)):
+        at, out[place, 2] = _predict(place, lattice, around, spot, px)
+        out[place, 0], out[place, 1] = at.real, at.imag
+    return out
 
 
 def grow(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -192,8 +213,8 @@ def grow(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, start: np.ndar
     for _ in range(ROUNDS - 1):
         _extend(lattice, around, px, spot)
         held = np.flatnonzero(spot >= 0)
-        at, spacing = predict_places(held, lattice, around, spot, px)
-        right = np.linalg.norm(px[spot[held]] - at, axis=1) <= FINAL_GATE * spacing
+        predicted = _predictions(lattice, around, px, spot)[held]
+        right = np.linalg.norm(px[spot[held]] - predicted[:, :2], axis=1) <= FINAL_GATE * predicted[:, 2]
         if right.all():
             return spot
         spot[held[~right]] = -1
@@ -201,29 +222,34 @@ def grow(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, start: np.ndar
     return spot
 
 
+@compiled()
 def _extend(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, spot: np.ndarray) -> None:
     """Add labels to a labelling ``spot`` (M,), from the labelled places outwards. Of the places that claim a spot the nearest gets it."""
-    for gate, least in zip(GATES, LEAST_AROUND, strict=True):
-        tried = np.zeros(len(lattice), int)
-        while True:
-            held = spot >= 0
-            place = np.flatnonzero(~held & (held[around[:, :NEAR]].sum(axis=1) >= 2))
-            count = held[around[place]].sum(axis=1)
-            place = place[(count >= least) & (count != tried[place])]
-            tried[place] = held[around[place]].sum(axis=1)
-            at, spacing = predict_places(place, lattice, around, spot, px)
-            known, free = np.isfinite(spacing), np.flatnonzero(np.bincount(spot[held], minlength=len(px)) == 0)
-            if not known.any() or not len(free):
-                break
-            distance, nearest = cKDTree(px[free]).query(at[known])
-            miss = distance / spacing[known]
-            order = np.argsort(-miss)
-            order = order[miss[order] < gate]
-            if not len(order):
-                break
-            claim = np.full(len(px), -1)
-            claim[free[nearest[order]]] = place[known][order]  # of several claims the last one stays, which is the nearest
-            spot[claim[claim >= 0]] = np.flatnonzero(claim >= 0)
+    taken, claim, miss, tried = np.zeros(len(px) + 1), np.empty(len(px), np.int64), np.empty(len(px)), np.empty(len(lattice), np.int64)
+    for held in spot:
+        taken[held] = 1.0  # the last entry is of places without a spot
+    for limit, gate in enumerate(GATES):
+        tried[:], more = 0, True
+        while more:
+            miss[:], more = gate, False
+            for place in range(len(lattice)):
+                near = count = 0
+                for k, other in enumerate(around[place]):
+                    near, count = near + (k < NEAR and spot[other] >= 0), count + (spot[other] >= 0)
+                if spot[place] >= 0 or near < 2 or count < LEAST_AROUND[limit] or count == tried[place]:
+                    continue
+                tried[place] = count
+                at, spacing = _predict(place, lattice, around, spot, px)
+                nearest, square = -1, np.inf
+                for k in range(len(px)):
+                    away = (px[k, 0] - at.real) ** 2 + (px[k, 1] - at.imag) ** 2
+                    if away < square and not taken[k]:
+                        nearest, square = k, away
+                if nearest >= 0 and np.sqrt(square) < miss[nearest] * spacing:
+                    miss[nearest], claim[nearest], more = np.sqrt(square) / spacing, place, True
+            for k in range(len(px)):
+                if miss[k] < gate:
+                    spot[claim[k]], taken[k] = k, 1.0
 
 
 def locate_places(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, spot: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
@@ -231,6 +257,6 @@ def locate_places(lattice: np.ndarray, around: np.ndarray, px: np.ndarray, spot:
 
     A predicted position may lie outside the frame. It then shows that the frame cuts a pin off.
     """
-    out, _ = predict_places(np.arange(len(lattice)), lattice, around, spot, px)
+    out = _predictions(lattice, around, np.ascontiguousarray(px), spot)[:, :2]
     out[~((out > -np.array(size_px)) & (out < 2 * np.array(size_px))).all(axis=1)] = np.nan
     return np.where((spot >= 0)[:, None], px[spot], out)

@@ -225,7 +225,10 @@ class RecordingMode(PageMode):
         if view is None or not self._active:
             return
         if view.given is not view.contact.model:  # it was loaded after the recording was opened
-            view = self._view = RecordingView(view.recording.path, view.contact)
+            renewed = RecordingView(view.recording.path, view.contact)
+            if self._view is not view:  # another one was opened meanwhile, and is shown next
+                return
+            view = self._view = renewed
         looked = self._next_doubt(view) if index < 0 else view.look(index)
         if looked is None:
             return

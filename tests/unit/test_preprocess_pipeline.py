@@ -13,9 +13,11 @@ from twin.camera.capture import record
 from twin.errors import FrameError
 from twin.frames import open_recording
 from twin.frames.forms import levels_at, raw_to_recording
+from twin.geometry.pins import pin_lattice
 from twin.pins import Pipeline, make_detector, measure_reference, nominal_reference, shipped_detector
 from twin.pins.finding.blobs import SPECK_LEVELS, circular_mask, despeckle, find_blobs
 from twin.pins.labelling.matching import confirm, match, rematch
+from twin.pins.labelling.reference import make_reference
 from twin.pins.labelling.split import split_chains
 from twin.pins.pipeline import LEAST_ABOVE, share_between
 from twin.types import Form, Frame
@@ -263,6 +265,20 @@ def test_rings_turned_on_by_a_pin_score_less_than_the_truth():
     np.testing.assert_array_equal(right.blob, true)
     assert right.score > wrong.score + 0.05 * len(true)
     assert right.score == pytest.approx(len(true), abs=0.1 * len(true))
+
+
+@pytest.mark.parametrize("layout", ["hexagon", "rings"])
+def test_a_small_layout_of_which_pins_are_lost_keeps_its_names(layout):
+    """It has one ring outside of those that a shifted labelling breaks, and one ring is as much like itself after any shift."""
+    pins = PinsSpec(layout=layout, rings=3)
+    rest = 40.0 * pin_lattice(pins).places
+    reference = make_reference(rest, pins)
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        seen = np.sort(rng.choice(pins.count, 30, replace=False))
+        found = match(reference, rest[seen] + rng.normal(0, 0.8, (30, 2)), np.full(30, 50.0))
+        assert (found.blob >= 0).sum() >= 29, seed
+        np.testing.assert_array_equal(seen[found.blob[found.blob >= 0]], np.flatnonzero(found.blob >= 0))
 
 
 @pytest.mark.parametrize("lights", [0, 1, 2])

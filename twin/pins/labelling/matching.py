@@ -61,6 +61,8 @@ TURN_WEIGHT = 1.5
 """Weight in the score, for each pin, of the rings' mean turn (1 minus its cosine)."""
 MAX_WINDING = 3
 """Largest shift of rings along themselves, in pins in each direction."""
+ROUNDING = 1e-9
+"""Difference of two sums of unit vectors that is only rounding."""
 BROKEN_RINGS = 2
 """Number of innermost rings that are left out when the shift is found, because they are inconsistent in a shifted labelling."""
 EXTENT_MARGIN = 0.02
@@ -599,10 +601,10 @@ def _ring_turns(reference: Reference, px: np.ndarray, blob: np.ndarray, most: in
 def _unwound(reference: Reference, px: np.ndarray, blob: np.ndarray) -> np.ndarray:
     """A labelling (N,) whose rings are shifted back by the number of pins with which they turn most alike.
 
-    If anything is shifted, the innermost rings lose their labels.
+    If anything is shifted, the innermost rings lose their labels. One ring alone is as much like itself after any shift, so its labels stay.
     """
     alike = np.abs(_ring_turns(reference, px, blob, MAX_WINDING)[:, BROKEN_RINGS:].sum(axis=1))
-    if alike[MAX_WINDING] == alike.max():
+    if alike[MAX_WINDING] > alike.max() - ROUNDING:
         return blob
     out = np.full(len(blob), -1)
     for ring in np.split(reference.slots, reference.ring_ends[1:-1])[BROKEN_RINGS:]:

@@ -601,7 +601,7 @@ def _ring_turns(reference: Reference, px: np.ndarray, blob: np.ndarray, most: in
 def _unwound(reference: Reference, px: np.ndarray, blob: np.ndarray) -> np.ndarray:
     """A labelling (N,) whose rings are shifted back by the number of pins with which they turn most alike.
 
-    If anything is shifted, the innermost rings lose their labels. One ring alone is as much like itself after any shift, so its labels stay.
+    If anything is shifted, the innermost rings lose their labels. One ring alone is like itself after any shift, so its labels stay.
     """
     alike = np.abs(_ring_turns(reference, px, blob, MAX_WINDING)[:, BROKEN_RINGS:].sum(axis=1))
     if alike[MAX_WINDING] > alike.max() - ROUNDING:

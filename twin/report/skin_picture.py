@@ -26,10 +26,10 @@ def main(folder: Path) -> None:
     """Load VTK, wait for the end of the standard input, and draw the surfaces of a folder."""
     import pyvista as pv
 
+    plotter = pv.Plotter(off_screen=True, window_size=list(WINDOW_PX))  # this loads the half of VTK
+    plotter.set_background("#0d1117", top="#27313f")  # type: ignore[arg-type]  # its decorator hides self from the checker
     sys.stdin.read()
     skin, pins, touched = (pv.PolyData(str(folder / f"{name}.vtp")) for name in ("skin", "pins", "object"))
-    plotter = pv.Plotter(off_screen=True, window_size=list(WINDOW_PX))
-    plotter.set_background("#0d1117", top="#27313f")  # type: ignore[arg-type]  # its decorator hides self from the checker
     scalars = "displacement_mm" if "displacement_mm" in skin.point_data else None
     plotter.add_mesh(
         _clip_surface(skin),

@@ -76,8 +76,11 @@ browser: setup   ## the studio in a real Chromium, wide and narrow; pictures in 
 tables: setup    ## make the documents' tables from figures.json
 	@$(SCRIPT) -m figures --tables
 
-docs: setup      ## the documentation, from this code, in out/docs; a warning is an error; NOTEBOOKS=written runs no notebook
+$(VENV)/.docs: $(VENV)/.installed
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,docs]'
+	@touch $@
+
+docs: setup $(VENV)/.docs ## the documentation, from this code, in out/docs; a warning is an error; NOTEBOOKS=written runs no notebook
 	@NOTEBOOKS=$(NOTEBOOKS) $(BIN)/python -m sphinx -W --keep-going -q -b html docs out/docs
 	@echo "wrote out/docs/index.html"
 

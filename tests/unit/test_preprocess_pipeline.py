@@ -16,7 +16,7 @@ from twin.frames.forms import levels_at, raw_to_recording
 from twin.geometry.pins import pin_lattice
 from twin.pins import Pipeline, make_detector, measure_reference, nominal_reference, shipped_detector
 from twin.pins.finding.blobs import SPECK_LEVELS, circular_mask, despeckle, find_blobs
-from twin.pins.labelling.matching import confirm, match, rematch
+from twin.pins.labelling.matching import _pairs, _put_in_cells, confirm, match, rematch
 from twin.pins.labelling.reference import make_reference
 from twin.pins.labelling.split import split_chains
 from twin.pins.pipeline import LEAST_ABOVE, share_between
@@ -265,6 +265,19 @@ def test_rings_turned_on_by_a_pin_score_less_than_the_truth():
     np.testing.assert_array_equal(right.blob, true)
     assert right.score > wrong.score + 0.05 * len(true)
     assert right.score == pytest.approx(len(true), abs=0.1 * len(true))
+
+
+@pytest.mark.parametrize("count", [3, 40, 400])
+def test_all_blobs_within_reach_of_a_place_are_its_pairs(count):
+    rng = np.random.default_rng(count)
+    reference, blobs_px = make_reference(40.0 * pin_lattice(PinsSpec(rings=3)).places, PinsSpec(rings=3)), rng.uniform(-50, 50, (count, 2))
+    places, reach = np.concatenate([reference.pins_px, [[np.nan, 0], [90, 90], [-60, 10]]]), rng.uniform(5, 40, 40)
+    pins, near, away2 = _pairs(places, reach, _put_in_cells(reference, blobs_px, np.ones(count)))
+    squares = ((places[:, None] - blobs_px) ** 2).sum(axis=2)
+    wanted = np.argwhere(squares < reach[:, None] ** 2)
+    order = np.lexsort([near, pins])
+    np.testing.assert_array_equal(np.column_stack([pins, near])[order], wanted)
+    np.testing.assert_allclose(away2[order], squares[tuple(wanted.T)], rtol=1e-12)
 
 
 @pytest.mark.parametrize("layout", ["hexagon", "rings"])

@@ -6,12 +6,10 @@ from scipy.spatial.transform import Rotation
 
 def matrix_of(pose: np.ndarray) -> np.ndarray:
     """``T_base_tool`` (4, 4) of an arm's pose (6,) in mm and deg."""
-    x, y, z, *angles = np.asarray(pose, float).tolist()
-    turns = np.radians(angles)
-    (sa, sb, sc), (ca, cb, cc) = np.sin(turns).tolist(), np.cos(turns).tolist()
-    along_x = [cb * cc, sa * sb * cc - ca * sc, ca * sb * cc + sa * sc, x]
-    along_y = [cb * sc, sa * sb * sc + ca * cc, ca * sb * sc - sa * cc, y]
-    return np.array([along_x, along_y, [-sb, sa * cb, ca * cb, z], [0.0, 0.0, 0.0, 1.0]])
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("xyz", np.asarray(pose, float)[3:], degrees=True).as_matrix()
+    T[:3, 3] = pose[:3]
+    return T
 
 
 def pose_of(T: np.ndarray, near: np.ndarray) -> np.ndarray:

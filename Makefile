@@ -27,6 +27,10 @@ $(VENV)/.installed: pyproject.toml requirements.lock
 	@$(BIN)/twin doctor --prepare >/dev/null 2>&1 || true # compiles ahead, half a minute
 	@touch $@
 
+$(VENV)/.with-%: $(VENV)/.installed # a further extra
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,$*]'
+	@touch $@
+
 # out/demo is the program's own folder: a demo of an earlier version there is replaced. In another folder only own files are.
 demo: setup      ## the main job: press, render, detect, graph; pictures and a page in out/demo, or in OUT=DIR
 	@$(BIN)/twin demo --out $(OUT) $(if $(filter $(DEMO),$(OUT)),--force)
@@ -52,8 +56,7 @@ bench: setup     ## speed, as ratios to named baselines in the same run
 	@$(SCRIPT) tests/bench/bench_render.py
 	@$(SCRIPT) tests/bench/bench_ros2.py
 
-validate: setup  ## heavier proofs: the recordings named by TACTIP_REAL, CalculiX, random contacts, Rerun (670 MB)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,rerun]'
+validate: setup $(VENV)/.with-rerun ## heavier proofs: the recordings named by TACTIP_REAL, CalculiX, random contacts, Rerun (670 MB)
 	@$(BIN)/python -m pytest -n 0 tests/unit/test_rerun_view.py
 	@$(BIN)/python -m pytest -m hypothesis --hypothesis-profile=anew tests  # other draws than those of make test
 	@$(BIN)/python -m pytest -m slow -n 0 -s tests
@@ -61,26 +64,20 @@ validate: setup  ## heavier proofs: the recordings named by TACTIP_REAL, Calculi
 figures: setup   ## every figure that a document states, into figures.json; goes on where it was; ONLY=pins,render for some, LIST=1 to list
 	@$(SCRIPT) -m figures $(if $(ONLY),--only $(ONLY)) $(if $(LIST),--list)
 
-film: setup      ## the studio's film and three pictures, in out/film; needs Debian's chromium
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,browser]'
+film: setup $(VENV)/.with-browser ## the studio's film and three pictures, in out/film; needs Debian's chromium
 	@$(SCRIPT) tests/browser/film.py --out out/film
 
 gallery: setup   ## the pictures of the gallery, from the code of its page, and the film of the gripper
 	@cd docs && PYTHONPATH=$(CURDIR) $(CURDIR)/$(BIN)/python -m generators.gallery
 	@cd docs && PYTHONPATH=$(CURDIR) MUJOCO_GL=$${MUJOCO_GL:-egl} $(CURDIR)/$(BIN)/python -m generators.gripper
 
-browser: setup   ## the studio in a real Chromium, wide and narrow; pictures in out/browser; skipped without Debian's chromium
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,browser]'
+browser: setup $(VENV)/.with-browser ## the studio in a real Chromium, wide and narrow; pictures in out/browser; skipped without Debian's chromium
 	@$(BIN)/python -m pytest -m slow -n 0 -rs tests/browser tests/system/test_studio_browser.py
 
 tables: setup    ## make the documents' tables from figures.json
 	@$(SCRIPT) -m figures --tables
 
-$(VENV)/.docs: $(VENV)/.installed
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[dev,docs]'
-	@touch $@
-
-docs: setup $(VENV)/.docs ## the documentation, from this code, in out/docs; a warning is an error; NOTEBOOKS=written runs no notebook
+docs: setup $(VENV)/.with-docs ## the documentation, from this code, in out/docs; a warning is an error; NOTEBOOKS=written runs no notebook
 	@NOTEBOOKS=$(NOTEBOOKS) $(BIN)/python -m sphinx -W --keep-going -q -b html docs out/docs
 	@echo "wrote out/docs/index.html"
 

@@ -26,7 +26,7 @@ def main(folder: Path) -> None:
     """Load VTK, wait for the end of the standard input, and draw the surfaces of a folder."""
     import pyvista as pv
 
-    plotter = pv.Plotter(off_screen=True, window_size=list(WINDOW_PX))  # this loads the half of VTK
+    plotter = pv.Plotter(off_screen=True, window_size=list(WINDOW_PX))  # this loads half of VTK
     plotter.set_background("#0d1117", top="#27313f")  # type: ignore[arg-type]  # its decorator hides self from the checker
     sys.stdin.read()
     skin, pins, touched = (pv.PolyData(str(folder / f"{name}.vtp")) for name in ("skin", "pins", "object"))

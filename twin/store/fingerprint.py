@@ -202,7 +202,7 @@ class _Module:
 def _read_module(root: Path, file: Path, name: str) -> _Module:
     try:
         source = file.read_bytes()
-        key = hashlib.sha256(b"\0".join([Path(__file__).read_bytes(), sys.version.encode(), name.encode(), source])).hexdigest()
+        key = hashlib.sha256(b"\0".join([*_reader(), name.encode(), source])).hexdigest()
         with suppress(LookupError, TypeError, ValueError):  # not stored, or damaged
             digest, imports, names = _known_modules()[str(file)][key]
             return _Module(
@@ -213,6 +213,12 @@ def _read_module(root: Path, file: Path, name: str) -> _Module:
         raise UnknownCodeError(f"{file}: not readable ({error}); install the program again") from error
     _known_modules()[str(file)] = {key: list(vars(found).values())}
     return found
+
+
+@cache
+def _reader() -> tuple[bytes, bytes]:
+    """What is found in a source also depends on this: the code here, and Python's version."""
+    return Path(__file__).read_bytes(), sys.version.encode()
 
 
 def _parse(source: str, name: str, is_package: bool) -> _Module:

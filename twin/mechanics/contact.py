@@ -171,9 +171,9 @@ def contact_forces(
     """
     probe, count = field.probe(at), len(at)
     force, pressing, depth, slipping = np.zeros((count, 3)), np.zeros(count), np.zeros(count), np.zeros(count, bool)
-    found = ContactForces(probe[1], force, pressing, depth, slipping, np.zeros((count, 3, 3)), at.copy())
-    _law(at, probe, soften * stiff, anchor, friction, bound, soften, np.empty(3), *list(vars(found).values())[1:])
-    return found
+    law = force, pressing, depth, slipping, np.zeros((count, 3, 3)), at.copy()
+    _law(at, probe, soften * stiff, anchor, friction, bound, soften, np.empty(3), *law)
+    return ContactForces(probe[1], *law)
 
 
 @compiled()

@@ -57,11 +57,7 @@ class Net:
     @cached_property
     def edges(self) -> np.ndarray:
         """Directed edges (E, 2) of the triangles, as ``directed_edges`` gives them."""
-        n = int(self.triangles.max())
-        joined = np.zeros((n + 1, n + 1), bool)
-        joined[self.triangles, self.triangles[:, (1, 2, 0)]] = True  # each side is that of two triangles, once in each direction
-        joined[:, n] = False
-        return np.column_stack(np.divmod(np.flatnonzero(joined[:n]), n + 1))
+        return directed_edges(self.triangles, self.triangles.max())
 
     def move(self, px: np.ndarray) -> "Net | None":
         """The net of the Delaunay triangles of nodes (n, 2) that moved.
@@ -83,7 +79,7 @@ class Net:
 def directed_edges(triangles: np.ndarray, n: int) -> np.ndarray:
     """Directed edges (E, 2), sorted: both directions of each side of the triangles over ``n`` nodes. Nodes from ``n`` on are left out."""
     corners = triangles[(triangles < n).all(axis=1)].astype(np.int64)
-    starts, ends = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
+    starts, ends = corners.ravel(), corners[:, (1, 2, 0)].ravel()
     joined = np.zeros(n * n, bool)
     joined[starts * n + ends] = joined[ends * n + starts] = True
     return np.column_stack(np.divmod(np.flatnonzero(joined), n))
